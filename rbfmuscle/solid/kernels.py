@@ -35,10 +35,6 @@ ROWS = 42
 
 ROUNDS = 10  # of the search for a squeezed point's nearest deformation, found anew each iteration
 STEPS = 3  # of Newton's method for a stretch in an iteration
-# Stretch over which the material along slack fibres begins to resist lengthening. Were it 0, the
-# stiffness would jump where fibres become taut, and with it the slope of a muscle's length over the
-# angle of a joint. With 0.05 and more a gluteus maximus has two shapes in some poses.
-TOE = 0.03
 
 
 def at_points(work: Floats, row: int, *shape: int) -> Floats:
@@ -108,10 +104,9 @@ def deform(y, nodes, slopes, points):
 def stress_points(work, tension):
     """R, t, stresses, cofactors and volumes at the points of a cell.
 
-    R is the rotation of F D(t) for the last t, then t >= lower minimises ½ |RᵀF - D(t)|² + e(t) +
-    tension t. The target is T = R (t aaᵀ + t^(-1/2) (I - aaᵀ)) and what springs along the fibre
-    want. Newton's steps are those of x, with t = 1 + x up to 1 and 1 + x TOE / (x + TOE) beyond,
-    where e' = 3/2 x² / (x + TOE).
+    R is the rotation of F D(t) for the last t, then t minimises |RᵀF - D(t)|² + 2 tension t in
+    [lower, 1]. The target is T = R (t aaᵀ + t^(-1/2) (I - aaᵀ)) and what springs along the fibre
+    want.
     """
     for p in range(POINTS):
         f = _matrix(work, GRADIENT, p)
@@ -135,27 +130,16 @@ def stress_points(work, tension):
         s = dot(ra, fa)
         across = dot(r[0], f[0]) + dot(r[1], f[1]) + dot(r[2], f[2]) - s
         lower = work[LOWER * POINTS + p]
-        toe = TOE if lower < 1.0 else 0.0
-        beyond = max(t - 1.0, 0.0)
-        x = min(t - 1.0, 0.0) + beyond * TOE / (TOE - beyond)
-        beyond = max(x, 0.0)
-        share = toe / (beyond + TOE)
         for _ in range(STEPS):
             v = 1.0 / t
             root = np.sqrt(v)
             slope = t - v * v - s + 0.5 * across * v * root + tension
-            slope += 1.5 * beyond * (1.0 - share)
             bend = 1.0 + 2.0 * v * v * v - 0.75 * across * v * v * root
-            bend = 1.5 + (bend - 1.5) * share * share
-            x = max(x - slope / max(bend, 0.5), lower - 1.0)
-            beyond = max(x, 0.0)
-            share = toe / (beyond + TOE)
-            t = 1.0 + min(x, 0.0) + beyond * share
+            t = min(max(t - slope / max(bend, 0.5), lower), 1.0)
         work[STRETCH * POINTS + p] = t
         u = 1.0 / np.sqrt(t)
         length = np.sqrt(dot(fa, fa) + 1e-12)
-        beyond = max(length - work[UPPER * POINTS + p], 0.0)
-        slack = max(length, lower) - beyond * (1.0 - toe / (beyond + TOE))
+        slack = min(max(length, lower), work[UPPER * POINTS + p])
         passive, active = work[PASSIVE * POINTS + p], work[ACTIVE * POINTS + p]
         wanted = passive * slack + active * work[CONTENT * POINTS + p]
         pull = wanted / length - passive - active

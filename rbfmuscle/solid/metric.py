@@ -1,13 +1,13 @@
 """The metric of a solid's iterations: what its nodes and its volumes yield to forces.
 
 At each quadrature point the energy is least over a rotation R exp(ω) and the stretch t of slack
-fibres, φ(F) = min ½ |F - R D(t)|² + e(t) + τ t. With S = RᵀF, P = sym(S D), E_k the generators of
-the rotations and x = (ω, t),
+fibres, φ(F) = min ½ |F - R D(t)|² + τ t. With S = RᵀF, P = sym(S D), E_k the generators of the
+rotations and x = (ω, t),
 
     ∂²φ / ∂F² = I - B M⁻¹ Bᵀ,    B = (R E_k D, R D'),
-    M_ωω = tr(P) I - P,    M_ωt = -S : E_k D',    M_tt = 1 + 2 / t³ - S : D'' + e'',
+    M_ωω = tr(P) I - P,    M_ωt = -S : E_k D',    M_tt = 1 + 2 / t³ - S : D'',
 
-t alone where it is not at its bound. Fibres beyond the band where they are slack add
+t alone where it is not at one of its bounds. Fibres beyond the band where they are slack add
 c n nᵀ ⊗ a aᵀ and what their tension holds across, and a region's pressure p adds -p ∂² det F / ∂F².
 With the second differences and the springs this is Newton's matrix H. Where the energy of a point
 has a negative second derivative a part of that is taken off, and all of it where H would not be
@@ -34,7 +34,6 @@ from rbfmuscle.solid.kernels import (
     POINTS,
     ROTATION,
     STRETCH,
-    TOE,
     UPPER,
     add_stiffness,
     at_points,
@@ -50,7 +49,7 @@ BULK = 200.0
 # deformation that has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with
 # det G >= LEAST.
 LEAST, STIFFNESS = 0.5, 100.0
-# Of a stretch: nearer to its bound it counts as at it.
+# Of a stretch: nearer to its bounds it counts as at them.
 AT_BOUND = 1e-6
 # Of a fibre's stretch: nearer to where it goes slack it counts as taut. At rest every fibre stands
 # there, and each iteration would find other ones slack.
@@ -103,23 +102,16 @@ class Metric(NamedTuple):
 
 
 def find_metric(
-    model: SolidModel,
-    gradient: Floats,
-    work: Floats,
-    squeezed: Booleans,
-    pressure: Floats,
-    *,
-    floor: float = FLOOR,
+    model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, pressure: Floats
 ) -> Metric:
     """The metric for gradients (M, 3, N) of the regions' volumes and their pressures (M,), where
-    the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,). ``floor`` is the
-    least stiffness of a point along any direction, over 2 μ, towards which it is raised.
+    the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
 
     LinAlgError where the gradients are not independent, or H is not positive definite.
     """
     count, _, nodes = gradient.shape
     points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS))
-    inverse = _positive_inverse(model, points, squeezed, floor)
+    inverse = _positive_inverse(model, points, squeezed)
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
     answer = flat @ inverse
     compliance = answer @ flat.T
@@ -131,13 +123,11 @@ def find_metric(
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def _positive_inverse(
-    model: SolidModel, points: Floats, squeezed: Booleans, floor: float
-) -> Floats:
+def _positive_inverse(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
     """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
     which H is positive definite.
     """
-    missing = lacking(points, floor)
+    missing = lacking(points)
     for share in SHARES:
         inverse = inverted(stiffness_matrix(model, points + share * missing, squeezed))
         if inverse is not None:
@@ -145,10 +135,10 @@ def _positive_inverse(
     raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
 
 
-def lacking(points: Floats, floor: float = FLOOR) -> Floats:
-    """What the stiffness (Q, 9, 9) of points lacks of a ``floor`` along any direction."""
+def lacking(points: Floats) -> Floats:
+    """What the stiffness (Q, 9, 9) of points lacks of `FLOOR` along any direction."""
     value, vector = np.linalg.eigh(points)
-    missing = np.maximum(floor - value, 0.0)
+    missing = np.maximum(FLOOR - value, 0.0)
     return np.asarray((vector * missing[:, None, :]) @ vector.swapaxes(1, 2))
 
 
@@ -221,10 +211,7 @@ def matrix_stiffness(work: Floats) -> Floats:
     s = turn.swapaxes(1, 2) @ f
     p = s @ wanted
     p = 0.5 * (p + p.swapaxes(1, 2))
-    lower = at_points(work, LOWER)
-    free = (t > lower * (1.0 + AT_BOUND)) & (lower < 1.0)
-    beyond = np.maximum(t - 1.0, 0.0)
-    toe = 1.5 * beyond * (2.0 * TOE - beyond) / (TOE - beyond) ** 2
+    free = (t > at_points(work, LOWER) * (1.0 + AT_BOUND)) & (t < 1.0 - AT_BOUND)
     ways = np.empty((len(t), 4, 3, 3))  # the columns of B, before R
     ways[:, :3] = GENERATORS @ wanted[:, None]
     ways[:, 3] = np.where(free[:, None, None], slope, 0.0)
@@ -234,8 +221,7 @@ def matrix_stiffness(work: Floats) -> Floats:
     matrix[:, :3, :3] = np.trace(p, axis1=1, axis2=2)[:, None, None] * np.eye(3) - p
     mixed = -np.einsum("qab,qkab->qk", s, GENERATORS @ slope[:, None]) * free[:, None]
     matrix[:, :3, 3] = matrix[:, 3, :3] = mixed
-    stiff = 1.0 + 2.0 / t**3 - (s * bend).sum(axis=(1, 2)) + toe
-    matrix[:, 3, 3] = np.where(free, stiff, 1.0)
+    matrix[:, 3, 3] = np.where(free, 1.0 + 2.0 / t**3 - (s * bend).sum(axis=(1, 2)), 1.0)
     root = np.linalg.inv(np.linalg.cholesky(gram))
     value, vector = np.linalg.eigh(root @ matrix @ root.swapaxes(1, 2))
     softer = 1.0 / np.maximum(value, 1e-3)
@@ -250,10 +236,9 @@ def fibre_stiffness(work: Floats) -> Floats:
     passive, active = at_points(work, PASSIVE), at_points(work, ACTIVE)
     fa = np.einsum("qab,qb->qa", f, a)
     length = np.sqrt((fa**2).sum(axis=1) + 1e-12)
-    beyond, toe = np.maximum(length - upper, 0.0), np.where(lower < 1.0, TOE, 0.0)
-    share = toe / (beyond + TOE)
-    stiff = passive * np.where(length > lower + TAUT, 1.0 - share**2, 1.0) + active
-    tension = passive * (beyond * (1.0 - share) + np.minimum(length - lower, 0.0))
+    slack = (length > lower + TAUT) & (length < upper - TAUT)
+    stiff = np.where(slack, 0.0, passive) + active
+    tension = passive * (length - np.clip(length, lower, upper))
     tension += active * (length - at_points(work, CONTENT))
     side = np.maximum(tension / length, 0.0)
     n = fa / length[:, None]

@@ -3,21 +3,16 @@
 With y the nodes of a `Lattice` and F = Σ_k y_k ∇N_k the deformation gradient at its quadrature
 points q, the nodes minimise
 
-    E(y) = 2 μ Σ_q w_q min over R, t of (½ |F_q - R D(t)|² + e(t) - τ (1 - t))
-         + 2 μ Σ_q w_q (c s(|F_q a|) + ½ a_q (|F_q a| - l)²),
-    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    t >= 1 / slack,
-    e'(t) = 3/2 (t - 1)² / (TOE - (t - 1)) beyond 1,
-    s'(λ) = (λ - 1)² / (λ - 1 + TOE) beyond 1, λ - 1 / slack below 1 / slack,
-    τ = min(ANTI_BUCKLING_TENSION (1 - d / d₀)², GREATEST_TENSION), d <= d₀,
+    E(y) = μ Σ_q w_q min over R, t of (|F_q - R D(t)|² - 2 τ (1 - t))
+         + μ Σ_q w_q (c (|F_q a| - s_q)² + a_q (|F_q a| - l)²),
+    D(t) = t aaᵀ + t^(-1/2) (I - aaᵀ),    1 / slack <= t <= 1,    s_q = |F_q a| kept within
+    1 / slack and 1,    τ = min(ANTI_BUCKLING_TENSION (1 - d / d₀)², GREATEST_TENSION), d <= d₀,
 
 subject to the volumes of the regions r of the lattice, V_r(y) = Σ_{q in r} w_q det F_q, and to the
 contacts. R is a rotation, a the fibre direction. Between 1 / slack and 1 a fibre shortens without
 resistance while the section thickens, and bears a small tension, 2 μ τ, which keeps a slack muscle
 straight. It grows as the muscle's ends approach, from their distance d₀ at rest to d, and depends
 on the bones alone: a tension that grew with the fibres' shortening would be a negative stiffness.
-Beyond 1 the resistance begins gradually, as the toe of a stress-strain curve: a bar bears the
-tension 2 μ (3/2 + c) x² / (x + TOE) at a small strain x along its fibres. Where slack = 1, no fibre
-is ever slack: t = 1, e = 0 and s = ½ (λ - 1)².
 c = 3/2 (fibre_ratio - 1) stiffens fibres that are longer or shorter than the band; a_q and l are
 those of active fibres (`activation.py`). For small stretches beyond the slack band and more and
 more nodes this is the incompressible solid of shear modulus μ, Young's modulus 3 μ across and
@@ -52,12 +47,11 @@ TOGETHER = 4.0
 NODES_PER_REGION = 8
 # Points that move by less than this fraction of the median for a unit force count as attached.
 MOBILE = 0.02
-# Tension of slack fibres over 2 μ. It begins with no slope: one that shortens fibres by more than
-# the ends approach, as any above 1.5 (1 - d / d₀) does, would straighten the muscle at the first
-# motion. Where it straightens the muscle within a few degrees, lengths bend there: with 30 in place
-# of 10 their second differences on the hip are a third greater. With 5 the adductor brevis, among
-# its neighbours, has two shapes in some poses.
-ANTI_BUCKLING_TENSION, GREATEST_TENSION = 10.0, 0.9
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.83 of their distance at rest,
+# and for shorter ones, it is 0.06 of that at full activation. It begins with no slope: a tension
+# that shortens fibres by more than the ends approach, as any above 1.5 (1 - d / d₀) does, would
+# straighten the muscle at the first motion.
+ANTI_BUCKLING_TENSION, GREATEST_TENSION = 30.0, 0.9
 BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.

@@ -11,7 +11,6 @@ import trimesh
 from conftest import ROOT
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
-from toe_law import spring_energy, toe_energy
 
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.models import build_models
@@ -30,7 +29,6 @@ from rbfmuscle.solid.kernels import (
     ROTATION,
     ROWS,
     STRETCH,
-    TOE,
     WEIGHT,
     at_points,
     local_step,
@@ -132,13 +130,10 @@ class Bar:
         wanted = wanted + across / np.sqrt(stretch)[:, None, None]
         gap = f - turn @ wanted
         along = np.linalg.norm(np.einsum("qab,qb->qa", f, given.direction), axis=1)
-        short, beyond = np.minimum(along - given.lower, 0.0), np.maximum(along - given.upper, 0.0)
-        slack = given.lower < 1.0
-        springs = 0.5 * short**2 + np.where(slack, spring_energy(beyond), 0.5 * beyond**2)
-        tone = tension * (1.0 - stretch)
-        points = 0.5 * (gap**2).sum(axis=(1, 2)) + given.passive * springs - tone
-        points += np.where(slack, toe_energy(stretch), 0.0)
-        return float(self.model.cells.weights @ points) + local.squeezed
+        beyond = along - np.clip(along, given.lower, given.upper)
+        tone = 2.0 * tension * (1.0 - stretch)
+        points = (gap**2).sum(axis=(1, 2)) + given.passive * beyond**2 - tone
+        return 0.5 * float(self.model.cells.weights @ points) + local.squeezed
 
 
 class Local(NamedTuple):
@@ -254,15 +249,12 @@ def test_cells_that_large_triangles_cross_with_their_inside_alone_hold_material(
     assert lattice.weights.sum() == pytest.approx(100 * 45 * 30 / 6, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("slack", "stretches"),
-    [(1.0, [0.8, 1.1, 1.1]), (1.6, [0.8, 1.1, 1.1]), (1.6, [1.1, 1.0, 0.9])],
-)
-def test_right_side_is_the_derivative_of_the_energy(slack, stretches):
+@pytest.mark.parametrize("slack", [1.0, 1.6])
+def test_right_side_is_the_derivative_of_the_energy(slack):
     solid = Bar().with_fibres([0.8, 0.6, 0.0], ratio=4.0, slack=slack)
     tension, rng = 0.3 * (slack - 1.0), np.random.default_rng(1)
     rest = solid.model.rest
-    base = rest * stretches + rng.normal(0, 0.3, rest.shape)
+    base = rest * [0.8, 1.1, 1.1] + rng.normal(0, 0.3, rest.shape)
     way = rng.normal(size=base.shape)
     h = 1e-4
     found = [solid.energy(base + step * way, tension) for step in (h, -h)]
@@ -272,15 +264,8 @@ def test_right_side_is_the_derivative_of_the_energy(slack, stretches):
 
 
 @pytest.mark.parametrize("pressed", [0.0, 0.7])
-@pytest.mark.parametrize(
-    ("slack", "stretches", "stretch"),
-    [
-        (1.0, [1.2, 1.1, 1.1], (1.0, 1.0)),
-        (2.0, [0.8, 1.3, 1.3], (0.51, 0.99)),
-        (2.0, [1.2, 1.0, 1.0], (1.001, 1.0 + TOE)),
-    ],
-)
-def test_stiffness_is_the_derivative_of_the_forces(slack, stretches, stretch, pressed):
+@pytest.mark.parametrize(("slack", "stretches"), [(1.0, [1.2, 1.1, 1.1]), (2.0, [0.8, 1.3, 1.3])])
+def test_stiffness_is_the_derivative_of_the_forces(slack, stretches, pressed):
     solid = Bar().with_fibres(ALONG, ratio=4.0, slack=slack)
     cells = solid.model.cells
     rng = np.random.default_rng(1)
@@ -295,10 +280,10 @@ def test_stiffness_is_the_derivative_of_the_forces(slack, stretches, stretch, pr
 
     ahead, behind = (force(base + step * way) for step in (h, -h))
     local = solid.localise(base, 0.1)
-    found = at_points(local.work, STRETCH)
-    assert ((found >= stretch[0]) & (found <= stretch[1])).all()
-    none = np.zeros(len(found), dtype=bool)
-    by_point = np.repeat(pressure[cells.region], len(found) // len(cells.region))
+    stretch = at_points(local.work, STRETCH)
+    assert (stretch == 1.0).all() if slack == 1.0 else ((stretch > 0.51) & (stretch < 0.99)).all()
+    none = np.zeros(len(stretch), dtype=bool)
+    by_point = np.repeat(pressure[cells.region], len(stretch) // len(cells.region))
     matrix = stiffness_matrix(solid.model, point_stiffness(local.work, by_point), none)
     found = (matrix @ way.ravel()).reshape(-1, 3) - solid.model.links @ way
     np.testing.assert_allclose(found, (behind - ahead) / (2 * h), atol=1e-4 * np.abs(found).max())
@@ -335,24 +320,6 @@ def test_a_bar_stays_straight_up_to_its_critical_load_and_buckles_beyond(push, l
     moved = bar.model.embedding.of(bar.state.nodes) - before
     middle = np.abs(before[:, 0]) < 2.0
     assert least <= np.linalg.norm(moved[middle, 1:].mean(axis=0)) <= most
-
-
-def test_steps_that_stay_too_long_make_the_metric_firmer_and_end_in_the_same_place(monkeypatch):
-    """With a bound on steps so low that all are too long at first."""
-    free, bound = Bar().with_fibres(ALONG, slack=1.6), Bar().with_fibres(ALONG, slack=1.6)
-    free.settle(shift(-4.0))
-    floors = []
-
-    def note(*given, floor):
-        floors.append(floor)
-        return find_metric(*given, floor=floor)
-
-    monkeypatch.setattr("rbfmuscle.solid.solve.find_metric", note)
-    monkeypatch.setattr("rbfmuscle.solid.solve.LONGEST", 1e-3)
-    bound.settle(shift(-4.0))
-    assert max(floors) > FLOOR and bound.report.caps == ()
-    apart = np.linalg.norm(bound.state.points - free.state.points, axis=1)
-    assert apart.max() < 4e-5 * free.model.size  # twice the error of a solve
 
 
 def test_motion_of_nodes_counts_by_what_hangs_on_them():
@@ -546,41 +513,23 @@ def moved(x, along, ratio=1.0, slack=1.0, steps=3):
 ALONG, ACROSS = [1.0, 0, 0], [0, 1.0, 0]
 
 
-@pytest.mark.parametrize("stretch", [0.5, 0.7, 1.02, 1.2])
+@pytest.mark.parametrize("stretch", [0.5, 0.7, 1.2])
 def test_energy_is_that_of_the_formula_with_fibres_stiffer_than_across(stretch):
     """Springs along the fibres have no part in the choice of t."""
     slack, tension = 1.6, 0.1
     f = np.array([stretch, 1.1 / np.sqrt(stretch), 1.0 / (1.1 * np.sqrt(stretch))])
 
-    def energy(t):
+    def miss(t):
         across = ((f[1:] - t**-0.5) ** 2).sum()
-        return 0.5 * ((f[0] - t) ** 2 + across) + toe_energy(t) - tension * (1.0 - t)
+        return (f[0] - t) ** 2 + across - 2.0 * tension * (1.0 - t)
 
-    bounds = 1.0 / slack, 1.0 + 0.999 * TOE
-    least = minimize_scalar(energy, bounds=bounds, options={"xatol": 1e-9}).fun
-    short, beyond = min(f[0] - 1.0 / slack, 0.0), max(f[0] - 1.0, 0.0)
-    wanted = least + 1.5 * 3.0 * (0.5 * short**2 + spring_energy(beyond))
+    least = minimize_scalar(miss, bounds=(1.0 / slack, 1.0), options={"xatol": 1e-9}).fun
+    beyond = f[0] - np.clip(f[0], 1.0 / slack, 1.0)
+    wanted = 0.5 * (least + 1.5 * 3.0 * beyond**2)
     solid = Bar().with_fibres(ALONG, ratio=4.0, slack=slack)
     found = solid.energy(solid.model.rest * f, tension) / solid.model.cells.weights.sum()
     # The bounded search stays off its bounds by its tolerance.
     assert found == pytest.approx(wanted, rel=1e-6)
-
-
-@pytest.mark.parametrize("strain", [0.002, 0.02, 0.1])
-def test_a_slack_bar_begins_to_resist_gradually(strain):
-    """Its tension over 2 μ is (1.5 + c) x² / (x + TOE) at a small strain x, and Young's modulus
-    beyond.
-    """
-    solid = Bar().with_fibres(ALONG, ratio=4.0, slack=1.6)
-
-    def energy(x):
-        return solid.energy(solid.model.rest * np.array([1.0 + x, *2 * [(1.0 + x) ** -0.5]]))
-
-    h = 1e-2 * strain
-    tension = (energy(strain + h) - energy(strain - h)) / (2 * h)
-    wanted = 1.5 * 4.0 * strain**2 / (strain + TOE)
-    volume = solid.model.cells.weights.sum()
-    assert tension / volume == pytest.approx(wanted, rel=max(2.0 * strain, 2e-3))
 
 
 def test_fibres_make_the_bar_stiffer_along_them():
@@ -596,8 +545,8 @@ def test_slack_fibres_shorten_along_themselves_almost_without_resistance():
     aside = moved(-6.0, ACROSS, slack=1.6)
     # The bar's ends are held, so some of the shortening is sheared; the rest costs nothing.
     assert loose.energy() < 0.15 * stiff.energy()
-    # Shortened across its fibres the bar is nearly as stiff as without them: these begin to resist.
-    assert 0.8 * stiff.energy() < aside.energy() < stiff.energy()
+    # Shortened across its fibres the bar is as stiff as without them.
+    assert aside.energy() == pytest.approx(stiff.energy(), rel=0.1)
     stretch, cells = loose.state.stretches, loose.model.cells
     assert stretch.min() > 1 / 1.6 and np.average(stretch, weights=cells.weights) < 0.9
     volumes = loose.localise(loose.state.nodes, 0.0).volumes
@@ -605,6 +554,9 @@ def test_slack_fibres_shorten_along_themselves_almost_without_resistance():
     # Beyond the band the energy grows with the square of what is left.
     near, far = (moved(x, ALONG, slack=1.1, steps=4).energy() for x in (-3.0, -10.0))
     assert far > 10.0 * near
+    # Pulled, they are those of the plain solid.
+    tight, slack = (moved(3.0, ALONG, slack=slack, steps=1).state.nodes for slack in (1.0, 1.6))
+    assert np.abs(tight - slack).max() < 0.1  # mm; near the held ends some fibres shorten
 
 
 def test_tension_of_slack_fibres_follows_the_ends():
@@ -613,9 +565,9 @@ def test_tension_of_slack_fibres_follows_the_ends():
     for x in (0.0, 2.0, -0.4, -4.0, -6.0, -12.0):
         solid.settle(shift(x))
         found.append(tension(solid.model, solid.state.anchors))
-    # 10 times the square of the approach of ends that are 40 apart, and no more than 0.9; the ends
+    # 30 times the square of the approach of ends that are 40 apart, and no more than 0.9; the ends
     # of moved vertices are as far apart to 1e-12.
-    assert found == pytest.approx([0.0, 0.0, 0.001, 0.1, 0.225, 0.9], abs=1e-10)
+    assert found == pytest.approx([0.0, 0.0, 0.003, 0.3, 0.675, 0.9], abs=1e-10)
 
 
 @pytest.mark.parametrize("name", ["extensor", "adductor_posterior"])
