@@ -15,7 +15,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
-from typing import ClassVar, Literal, NamedTuple, Self, TypeAlias
+from typing import Literal, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,15 +62,18 @@ class Polynomial:
 
 
 @dataclass(frozen=True)
-class PiecewiseLinear:
-    """Through points (x, y), straight between them; the first and the last piece go on beyond
-    them.
+class Curve:
+    """Through points (x, y), straight between them, or a cubic spline of ``degree`` 3; beyond them
+    it goes on straight.
+
+    The spline is that of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline: the
+    third derivative of the first and of the last piece is that of the cubic through the four points
+    there.
     """
 
     x: tuple[float, ...]
     y: tuple[float, ...]
-
-    degree: ClassVar[int] = 1
+    degree: int = 1  # or 3
 
     @cached_property
     def _pieces(self) -> list[list[float]]:
@@ -80,14 +83,11 @@ class PiecewiseLinear:
         from scipy.interpolate import make_interp_spline
 
         x, y = np.array(self.x), np.array(self.y)
-        if self.degree == 1 or len(x) < 3:
-            curve = make_interp_spline(x, y, k=min(1, len(x) - 1))
-        else:  # three points: one parabola
-            ends = (
-                [(3, 6.0 * _third(x[s], y[s]) if len(x) > 3 else 0.0)]
-                for s in (np.s_[:4], np.s_[-4:])
-            )
-            curve = make_interp_spline(x, y, k=3, bc_type=tuple(ends))
+        ends = None
+        if self.degree == 3 and len(x) > 3:  # three points: one parabola
+            cubics = (make_interp_spline(x[s], y[s]) for s in (np.s_[:4], np.s_[-4:]))
+            ends = tuple([(3, float(cubic(x[0], nu=3)))] for cubic in cubics)
+        curve = make_interp_spline(x, y, k=min(self.degree, len(x) - 1), bc_type=ends)
         pieces = np.stack([curve(x, nu=n) / math.factorial(n) for n in (3, 2, 1, 0)], axis=1)
         straight = pieces * [0.0, 0.0, 1.0, 1.0]
         return np.stack([straight[0], *pieces[:-1], straight[-1]]).tolist()
@@ -99,22 +99,11 @@ class PiecewiseLinear:
         t = values[0] - self.x[max(k - 1, 0)]
         return ((a * t + b) * t + c) * t + d
 
-    def rescaled(self, inputs: list[float], output: float) -> Self:
+    def rescaled(self, inputs: list[float], output: float) -> "Curve":
         """Return the function in other units."""
         return replace(
             self, x=tuple(v * inputs[0] for v in self.x), y=tuple(v * output for v in self.y)
         )
-
-
-class Spline(PiecewiseLinear):
-    """Cubic spline through points; beyond them it goes on straight.
-
-    It is the spline of Forsythe, Malcolm and Moler (1977), which OpenSim calls SimmSpline: the
-    third derivative of the first and of the last piece is that of the cubic through the four points
-    there.
-    """
-
-    degree = 3
 
 
 @dataclass(frozen=True)
@@ -135,7 +124,7 @@ class Multivariate:
         )
 
 
-Function = Linear | Polynomial | PiecewiseLinear | Multivariate
+Function = Linear | Polynomial | Curve | Multivariate
 
 
 def exponents(dimension: int, order: int) -> np.ndarray:
@@ -154,38 +143,25 @@ def scaled(function: Function, factor: float) -> Function:
     return function.rescaled([1.0] * count, factor)
 
 
-def _third(x, y):
-    """Third divided difference of four points."""
-    table = y
-    for order in range(1, 4):
-        table = np.diff(table) / (x[order:] - x[:-order])
-    return float(table[0])
-
-
 MotionKind: TypeAlias = Literal["rotation", "translation", "coupled"]
 X = (1.0, 0.0, 0.0)  # directions
 Y = (0.0, 1.0, 0.0)
 Z = (0.0, 0.0, 1.0)
 
 
-class Kind(NamedTuple):
-    """What a kind of joint fixes: the axes of its coordinates, turning ones first."""
-
-    rotations: tuple = ()
-    translations: tuple = ()
-
-
-# All that is known of a kind stands here; files, code, messages and tests read this table. What a
-# custom joint has is given with it.
-KINDS = {
-    "weld": Kind(),
-    "hinge": Kind((Z,)),
-    "slide": Kind((), (X,)),
-    "universal": Kind((X, Y)),
-    "ball": Kind((X, Y, Z)),
-    "planar": Kind((Z,), (X, Y)),
-    "free": Kind((X, Y, Z), (X, Y, Z)),
-    "custom": Kind(),
+# All that is known of a kind stands here: the axes that its coordinates turn about, then those that
+# they shift along; files, code, messages and tests read this table. What a custom joint has is given
+# with it.
+Axes: TypeAlias = tuple[tuple[float, float, float], ...]
+KINDS: dict[str, tuple[Axes, Axes]] = {
+    "weld": ((), ()),
+    "hinge": ((Z,), ()),
+    "slide": ((), (X,)),
+    "universal": ((X, Y), ()),
+    "ball": ((X, Y, Z), ()),
+    "planar": ((Z,), (X, Y)),
+    "free": ((X, Y, Z), (X, Y, Z)),
+    "custom": ((), ()),
 }
 STRAIGHT = 1e-8  # radian; a smaller turn has no direction of its own
 MOST_AXES = 6  # of a custom joint
@@ -253,7 +229,7 @@ class Joint(Compared):
     backward: bool = False  # written from child to parent: its motion is inverted
     # What the third axis carries as the joint turns: a point of an ellipsoid with these radii along
     # the three axes, where its normal is that axis; or the end of an arc of this length.
-    radii: tuple[float, float, float] | None = None
+    radii: tuple[float, ...] | None = None
     arc: float = 0.0
     guess: GuessTable | None = None  # of a joint that nobody has confirmed
 
@@ -527,7 +503,7 @@ class FunctionTable(Table):
                     )
             found = Multivariate(tuple((c, *map(int, powers)) for c, *powers in self.terms))
         elif points is not None:
-            found = (Spline if self.spline else PiecewiseLinear)(tuple(points.x), tuple(points.y))
+            found = Curve(tuple(points.x), tuple(points.y), 3 if self.spline else 1)
         else:
             *slopes, constant = self.linear or [1.0, 0.0]
             if len(slopes) != count:
@@ -635,22 +611,17 @@ class JointTable(Table):
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
             for motion, group in groups.items()
         )
-        centre = np.array(self.centre or (0.0, 0.0, 0.0))
-        radii = None
-        if self.radii is not None:
-            x, y, z = self.radii
-            radii = x, y, z
         return Joint(
             self.name,
             self.parent,
             self.child,
-            centre,
+            np.array(self.centre or (0.0, 0.0, 0.0)),
             coordinates,
             turns,
             shifts,
             kind,
             self.backward,
-            radii,
+            None if self.radii is None else tuple(self.radii),
             self.arc,
             self.guess,
         )
@@ -670,15 +641,15 @@ class JointTable(Table):
             raise SceneError(
                 f"{context}: rotations and translations belong to type 'custom', give axes"
             )
-        usual = [*KINDS[kind].rotations, *KINDS[kind].translations]
+        turns, shifts = KINDS[kind]
+        usual = [*turns, *shifts]
         axes = self.axes or dict(zip(self.coordinates, usual))
         count = len(axes) or len(self.coordinates)
         if count != len(usual):
             words = f"{len(usual)} coordinates, {count} are given; name them in axes"
             raise SceneError(f"{context}: a {kind} joint has {words}")
         tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
-        turning = len(KINDS[kind].rotations)
-        return {"rotation": tables[:turning], "translation": tables[turning:]}
+        return {"rotation": tables[: len(turns)], "translation": tables[len(turns) :]}
 
 
 class CouplingTable(FunctionTable):
@@ -786,4 +757,4 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
     if isinstance(function, Multivariate):
         return {"terms": [list(term) for term in function.terms]}
     points = {"x": list(function.x), "y": list(function.y)}
-    return {"spline" if isinstance(function, Spline) else "piecewise": points}
+    return {"spline" if function.degree == 3 else "piecewise": points}

@@ -14,11 +14,10 @@ from toy_scene import held
 from rbfmuscle.scene.check import check_scene
 from rbfmuscle.scene.joints import (
     KINDS,
+    Curve,
     JointTable,
     Linear,
-    PiecewiseLinear,
     Polynomial,
-    Spline,
     all_coordinates,
     coordinate_values,
     joint_row,
@@ -68,7 +67,7 @@ class TestFunctions:
 
     def test_spline_of_a_cubic_is_that_cubic_and_goes_on_straight(self):
         cubic = np.poly1d([0.3, -1.0, 0.5, 2.0])
-        mine = Spline(self.X, tuple(cubic(np.array(self.X))))
+        mine = Curve(self.X, tuple(cubic(np.array(self.X))), degree=3)
         for q in np.linspace(0, 3.5, 50):
             assert mine(q) == pytest.approx(cubic(q), abs=1e-12)
         assert mine(-2.0) == pytest.approx(cubic(0.0) - 2.0 * cubic.deriv()(0.0), abs=1e-12)
@@ -79,8 +78,8 @@ class TestFunctions:
         [
             Linear((2.0,), 0.3),
             Polynomial((0.5, -1.0, 2.0)),
-            PiecewiseLinear((-1.0, 0.5, 2.0), (1.0, 4.0, 2.0)),
-            Spline((-1.0, 0.5, 2.0, 2.5), (1.0, 4.0, 2.0, 0.0)),
+            Curve((-1.0, 0.5, 2.0), (1.0, 4.0, 2.0)),
+            Curve((-1.0, 0.5, 2.0, 2.5), (1.0, 4.0, 2.0, 0.0), degree=3),
         ],
         ids=lambda f: type(f).__name__,
     )
@@ -93,13 +92,13 @@ class TestFunctions:
 class TestKinds:
     @pytest.mark.parametrize("kind", sorted(set(KINDS) - {"custom", "weld"}))
     def test_each_coordinate_turns_or_shifts_along_its_axis(self, kind):
-        facts = KINDS[kind]
-        directions = [*facts.rotations, *facts.translations]
+        turns, shifts = KINDS[kind]
+        directions = [*turns, *shifts]
         scene = pair(type=kind, coordinates={f"q{k}": {} for k in range(len(directions))})
         centre = np.array([3.0, -2.0, 5.0])
         for k, axis in enumerate(directions):
             pose = bone_poses(scene, {f"j.q{k}": 0.4})["b"]
-            if k < len(facts.rotations):
+            if k < len(turns):
                 assert pose[:3, :3] == pytest.approx(
                     Rotation.from_rotvec(0.4 * np.array(axis)).as_matrix()
                 )

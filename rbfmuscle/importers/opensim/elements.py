@@ -23,13 +23,12 @@ from scipy.spatial.transform import Rotation
 from rbfmuscle.scene.joints import (
     Coordinate,
     Coupling,
+    Curve,
     Function,
     Joint,
     Linear,
     Multivariate,
-    PiecewiseLinear,
     Polynomial,
-    Spline,
     all_coordinates,
     coordinate_values,
     exponents,
@@ -506,8 +505,7 @@ def _read(node):
             raise node.owner.error(
                 f"{node.tag} needs as many y as x, and x that increase, got {len(x)} and {len(y)}"
             )
-        kind = Spline if node.tag in SPLINES else PiecewiseLinear
-        return kind(tuple(x), tuple(y))
+        return Curve(tuple(x), tuple(y), 3 if node.tag in SPLINES else 1)
     raise node.owner.error(
         f"a function {node.tag!r} is not in the table of functions; "
         "use a SimmSpline or a PolynomialFunction instead"

@@ -81,7 +81,7 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     if kind == "custom":
         axes = _custom_axes(node, names)
     else:
-        turns, shifts = KINDS[kind][:2] if kind in KINDS else (CARRYING[kind], ())
+        turns, shifts = KINDS[kind] if kind in KINDS else (CARRYING[kind], ())
         own = [TransformAxis(axis, (one,)) for axis, one in zip((*turns, *shifts), names)]
         axes = {"rotation": tuple(own[: len(turns)]), "translation": tuple(own[len(turns) :])}
     joints = [ModelJoint(name, parent, child, np.zeros(3), {}, kind=kind)]
@@ -124,7 +124,7 @@ def _coordinates(node, tag, kind):
             else []
         )
         return found, list(dict.fromkeys([*names, *named]))
-    turns, shifts = KINDS[kind][:2] if kind in KINDS else (CARRYING[kind], ())
+    turns, shifts = KINDS[kind] if kind in KINDS else (CARRYING[kind], ())
     needed = len(turns) + len(shifts) + (kind == "scapulothoracic")
     names += [f"_coord_{k}" for k in range(len(names), needed)]
     if len(names) != needed:
