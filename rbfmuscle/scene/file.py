@@ -7,25 +7,17 @@ import os
 import re
 import shutil
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import trimesh
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from rbfmuscle.geometry.arrays import Integers
-from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.joints import (
-    Coupling,
-    CouplingTable,
-    Joint,
-    JointTable,
-    coupling_row,
-    joint_row,
-)
+from rbfmuscle.scene.joints import CouplingTable, JointTable
 from rbfmuscle.scene.meshes.read import MeshTransform
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import (
@@ -99,9 +91,6 @@ def attachment_file(muscle: str, bone: str) -> str:
     return f"attachments/{muscle}.{bone}.txt"
 
 
-TableRow: TypeAlias = tuple[str, Mapping[str, object]]  # the head of a table, and its keys
-
-
 class SceneFiles:
     """The files of one scene, each written when its table is made into a folder that is there, or a
     new one beside the scene's own file; paths are relative to that file.
@@ -131,37 +120,39 @@ class SceneFiles:
                 shutil.rmtree(self.folder, ignore_errors=True)
             raise
 
-    def skeleton(
-        self,
-        bones: Sequence[Bone],
-        meshless_bones: Sequence[str],
-        joints: list[Joint],
-        couplings: Sequence[Coupling],
-    ) -> list[TableRow]:
-        """``[[bone]]``, the meshes written, ``[[joint]]`` and ``[[coupling]]``."""
-        meshes = {bone.name: self._mesh("bones", bone.name, bone.mesh) for bone in bones}
-        return [
-            *(("[[bone]]", {"name": name, "mesh": mesh}) for name, mesh in meshes.items()),
-            *(("[[bone]]", {"name": name}) for name in meshless_bones),
-            *(("[[joint]]", joint_row(joint)) for joint in joints),
-            *(("[[coupling]]", coupling_row(coupling, joints)) for coupling in couplings),
+    def mesh(self, folder: str, name: str, mesh: trimesh.Trimesh) -> str:
+        """Write a PLY file in double precision, which trimesh does not, and return its name."""
+        file = self._new(f"{folder}/{name}.ply")
+        faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
+        faces["count"] = 3
+        faces["corners"] = mesh.faces
+        head = [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"element vertex {len(mesh.vertices)}",
+            *(f"property double {axis}" for axis in "xyz"),
+            f"element face {len(faces)}",
+            "property list uchar int vertex_indices",
+            "end_header\n",
         ]
+        vertices = np.asarray(mesh.vertices, dtype="<f8")
+        file.write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
+        return self._relative(file)
 
     def muscle(self, muscle: Muscle) -> dict[str, object]:
         """``[[muscle]]``, its mesh, attached vertices and fibres written."""
         attach: list[dict[str, object]] = []
         row: dict[str, object] = {
             "name": muscle.name,
-            "mesh": self._mesh("muscles", muscle.name, muscle.mesh),
+            "mesh": self.mesh("muscles", muscle.name, muscle.mesh),
             "model": {"name": muscle.model, **muscle.options},
             "attach": attach,
         }
         for number, held in enumerate(muscle.attachments, 1):
-            name = attachment_file(f"{muscle.name}.{number}", held.bone)
-            entry: dict[str, object] = {
-                "bone": held.bone,
-                "vertices": self._listed(name, held.vertices),
-            }
+            listed = self._listed(
+                attachment_file(f"{muscle.name}.{number}", held.bone), held.vertices
+            )
+            entry: dict[str, object] = {"bone": held.bone, "vertices": listed}
             if held.tendon is not None:
                 entry["tendon"] = held.tendon.model_dump(exclude_unset=True)
             if held.via:
@@ -183,29 +174,14 @@ class SceneFiles:
             row |= muscle.contraction.model_dump(exclude_unset=True)
         return row
 
-    def settings(self, tables: Mapping[str, Table | None]) -> list[TableRow]:
-        """Tables of settings that say something, by their names; the file of a motion is copied."""
-        found: list[TableRow] = []
-        for key, table in tables.items():
-            if table is None:
-                continue
-            row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
-            if "file" in row:
-                file = self._new(row["file"].name)
-                shutil.copyfile(row["file"], file)
-                row["file"] = self._relative(file)
-            if row:
-                found.append((f"[{key}]", row))
-        return found
-
-    def write(self, tables: Sequence[TableRow], comment: str) -> Path:
-        """Write the file itself: a comment, then the heads and rows of its tables. Returns its
-        path.
-        """
-        parts = [comment] if comment else []
-        parts += [table_text(head, row) for head, row in tables]
-        self.path.write_text("\n".join(parts), encoding="utf-8")
-        return self.path
+    def settings(self, table: Table) -> dict[str, object]:
+        """What a table of settings says; the file of a motion is copied."""
+        row = table.model_dump(by_alias=True, exclude_unset=True, exclude_none=True)
+        if "file" in row:
+            file = self._new(row["file"].name)
+            shutil.copyfile(row["file"], file)
+            row["file"] = self._relative(file)
+        return row
 
     def _new(self, name: str) -> Path:
         file = self.folder / name
@@ -220,25 +196,6 @@ class SceneFiles:
 
     def _relative(self, file: Path) -> str:
         return file.relative_to(self.path.parent).as_posix()
-
-    def _mesh(self, folder: str, name: str, mesh: trimesh.Trimesh) -> str:
-        """Write a PLY file in double precision, which trimesh does not, and return its name."""
-        file = self._new(f"{folder}/{name}.ply")
-        faces = np.zeros(len(mesh.faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
-        faces["count"] = 3
-        faces["corners"] = mesh.faces
-        head = [
-            "ply",
-            "format binary_little_endian 1.0",
-            f"element vertex {len(mesh.vertices)}",
-            *(f"property double {axis}" for axis in "xyz"),
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header\n",
-        ]
-        vertices = np.asarray(mesh.vertices, dtype="<f8")
-        file.write_bytes("\n".join(head).encode() + vertices.tobytes() + faces.tobytes())
-        return self._relative(file)
 
 
 Tables = dict[str, object]  # of a TOML file, unchecked
@@ -298,19 +255,18 @@ def _merged(inner: Tables, own: Tables, context: str) -> Tables:
     tables take the place of included ones; classes do so one by one, and ``[scene]`` by keys.
     """
     found = inner | own
-    for key in LISTS:
-        given = [data[key] for data in (inner, own) if key in data]
-        lists = [part for part in given if isinstance(part, list)]
-        if lists and len(lists) == len(given):
-            found[key] = [row for part in lists for row in part]
-    for key in ("scene", "classes"):
-        first, second = inner.get(key), own.get(key)
-        if isinstance(first, dict) and isinstance(second, dict):
+    for key in inner.keys() & own.keys():
+        first = inner[key]
+        second = own[key]
+        if key in LISTS and isinstance(first, list) and isinstance(second, list):
+            found[key] = [*first, *second]
+        elif key in ("scene", "classes") and isinstance(first, dict) and isinstance(second, dict):
             found[key] = first | second
-    abouts = (data.get("scene") for data in (inner, own))
-    first, second = (about.get("units") if isinstance(about, dict) else None for about in abouts)
-    if None not in (first, second) and first != second:
-        raise SceneError(f"{context}its lengths are in {shown(first)}, not in {shown(second)}")
+            units = first.get("units"), second.get("units")
+            if key == "scene" and None not in units and units[0] != units[1]:
+                raise SceneError(
+                    f"{context}its lengths are in {shown(units[0])}, not in {shown(units[1])}"
+                )
     return found
 
 
@@ -396,16 +352,7 @@ def _check_model(model):
     return model
 
 
-class MuscleKeys(ContractionTable, MeshTransform):
-    """Keys of a muscle that say where its mesh lies, and how it contracts."""
-
-    @property
-    def contraction(self) -> dict[str, object]:
-        """The keys of a muscle that contracts, those that are given."""
-        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
-
-
-class ClassTable(MuscleKeys):
+class ClassTable(ContractionTable, MeshTransform):
     """``[classes.NAME]``: keys of a muscle, for those of the class that do not give them
     themselves.
     """
@@ -414,6 +361,11 @@ class ClassTable(MuscleKeys):
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
     aponeuroses: AponeurosesTable | None = None
+
+    @property
+    def contraction(self) -> dict[str, object]:
+        """The keys of a muscle that contracts, those that are given."""
+        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
 
 
 class MuscleTable(ClassTable):

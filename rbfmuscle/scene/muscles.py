@@ -19,7 +19,7 @@ from rbfmuscle.geometry.frames import numbered_by_place
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.scene.activation import contraction_keys, make_contraction
 from rbfmuscle.scene.bone import Bone
-from rbfmuscle.scene.file import MuscleKeys
+from rbfmuscle.scene.file import ClassTable
 from rbfmuscle.scene.joints import Joint, bones_between, rigid_body
 from rbfmuscle.scene.meshes.read import MeshInput, MeshTransform, as_mesh, read_fibres
 from rbfmuscle.scene.meshes.repair import ReadMesh
@@ -108,7 +108,7 @@ def make_muscle(
     """A muscle without the ends of its tendons; `Scene.add_muscle` says what it is given."""
     context = f"muscle {name!r}"
     given = {key: value for key, value in keys.items() if value is not None}
-    placed = MuscleKeys.build(given, context=f"{context} ")
+    placed = ClassTable.build(given, context=f"{context} ")
     read = as_mesh(mesh, name, placed, may_be_open=False)
     model_name, options = split_model(model, context=context)
     return Muscle(

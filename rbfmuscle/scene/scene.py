@@ -13,7 +13,15 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.content import Compared
-from rbfmuscle.scene.file import ABOUT, FORMAT, SceneFile, SceneFiles, given_keys, read_scene_file
+from rbfmuscle.scene.file import (
+    ABOUT,
+    FORMAT,
+    SceneFile,
+    SceneFiles,
+    given_keys,
+    read_scene_file,
+    table_text,
+)
 from rbfmuscle.scene.frames import make_motion, slice_motion
 from rbfmuscle.scene.joints import (
     Coupling,
@@ -22,6 +30,8 @@ from rbfmuscle.scene.joints import (
     JointTable,
     all_coordinates,
     check_tree,
+    coupling_row,
+    joint_row,
     make_coupling,
     ordered,
 )
@@ -274,15 +284,25 @@ class Scene(Compared):
         files = SceneFiles(Path(path), folder)
         about = {key: getattr(self, key) for key in ABOUT if getattr(self, key)}
         with files.kept_whole():
-            unfelt = [("", {"neighbours": False})] if self.neighbours is None else []
-            tables = [
-                *unfelt,
-                ("[scene]", {"format": FORMAT, "name": self.name, **about}),
-                *files.skeleton(self.bones, self.meshless_bones, self.joints, self.couplings),
-                *(("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles),
-                *files.settings(_settings(self)),
+            rows: list[tuple[str, Mapping[str, object]]] = [
+                ("[scene]", {"format": FORMAT, "name": self.name, **about})
             ]
-            return files.write(tables, comment)
+            for bone in self.bones:
+                mesh = files.mesh("bones", bone.name, bone.mesh)
+                rows.append(("[[bone]]", {"name": bone.name, "mesh": mesh}))
+            rows += [("[[bone]]", {"name": name}) for name in self.meshless_bones]
+            rows += [("[[joint]]", joint_row(joint)) for joint in self.joints]
+            rows += [("[[coupling]]", coupling_row(one, self.joints)) for one in self.couplings]
+            rows += [("[[muscle]]", files.muscle(muscle)) for muscle in self.muscles]
+            for key, table in _settings(self).items():
+                if table is None:
+                    rows.insert(0, ("", {key: False}))
+                elif row := files.settings(table):
+                    rows.append((f"[{key}]", row))
+            parts = [comment] if comment else []
+            parts += [table_text(head, row) for head, row in rows]
+            files.path.write_text("\n".join(parts), encoding="utf-8")
+        return files.path
 
     def add_bone(
         self,
