@@ -74,19 +74,8 @@ class Poses(dict[str, Floats]):
         self.tendons: dict[str, TendonLine] = {}
 
     def __missing__(self, name: str) -> Floats:
-        self.tendons[name], pose = self._ends[name].place(self)
-        self[name] = pose
-        return pose
-
-
-class _Mark(NamedTuple):
-    """A point (3,) on a string, the direction (3,) there, and how many legs of the string end
-    before it.
-    """
-
-    point: Floats
-    direction: Floats
-    legs: int
+        self.tendons[name], self[name] = self._ends[name].place(self)
+        return self[name]
 
 
 @dataclass(eq=False)
@@ -110,10 +99,13 @@ class TendonEnd:
         return line_length(self._tendon(self.middle, 0, AT_REST))
 
     @cached_property
-    def _rest(self) -> tuple[float, _Mark]:
-        """Length of the string at rest, and its point at the tendon's length from the insertion."""
+    def _rest(self) -> tuple[float, Floats, Floats]:
+        """Length of the string at rest, its point (3,) at the tendon's length from the insertion,
+        and the direction (3,) there.
+        """
         legs = self._string(AT_REST)
-        return sum(map(line_length, legs)), _mark(legs, self.length)
+        point, direction, _ = _point_on(legs, self.length)
+        return sum(map(line_length, legs)), point, direction
 
     @cached_property
     def _sides(self) -> list[Floats]:
@@ -130,16 +122,16 @@ class TendonEnd:
         sides = [_outwards(self.obstacles, *leg) for leg in zip(places, stops, stops[1:])]
         along = [unit(b - a) for a, b in itertools.pairwise(stops)]
         own = unit(across(self.middle - stops[belly], along[belly]))
-        by_end, outwards = (line_length(self._leg_at_rest(belly, s)) for s in (own, sides[belly]))
+        by_end, outwards = (line_length(self._leg(belly, s, AT_REST)) for s in (own, sides[belly]))
         if by_end < SHORTER * outwards:
             sides[belly] = own
         for leg, side in enumerate(sides):
-            if _too_deep(self._leg_at_rest(leg, side), self.obstacles, self.radii[1]) > 0.0:
+            if _too_deep(self._leg(leg, side, AT_REST), self.obstacles, self.radii[1]) > 0.0:
                 around = [
                     rotation_about(along[leg], angle, np.zeros(3))[:3, :3] @ side
                     for angle in 2.0 * np.pi / AROUND * np.arange(AROUND)
                 ]
-                lines = [self._leg_at_rest(leg, direction) for direction in around]
+                lines = [self._leg(leg, direction, AT_REST) for direction in around]
                 faults = [
                     (_too_deep(line, self.obstacles, self.radii[1]), line_length(line))
                     for line in lines
@@ -147,23 +139,18 @@ class TendonEnd:
                 sides[leg] = around[faults.index(min(faults))]
         return sides
 
-    def _leg_at_rest(self, leg: int, side: Floats) -> Floats:
-        """A leg of the string at rest (n, 3), passing bones on a side (3,)."""
-        stops = [*self.other, *self.line][leg : leg + 2]
-        return self._legs([point for _, point in stops], stops, [side], AT_REST)[0]
-
     def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
         """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
         the bones.
         """
-        at_rest, before = self._rest
+        at_rest, before, along_before = self._rest
         legs = self._string(poses)
         length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))
-        now = _mark(legs, length)
-        turn = self._turn(before.direction, now.direction, poses)
-        middle = now.point + turn @ (self.middle - before.point)
-        middle = middle + self._lift(turn, middle, now.direction, poses)
-        passed = max(0, now.legs - len(self.other) + 1)
+        now, along_now, ended = _point_on(legs, length)
+        turn = self._turn(along_before, along_now, poses)
+        middle = now + turn @ (self.middle - before)
+        middle = middle + self._lift(turn, middle, along_now, poses)
+        passed = max(0, ended - len(self.other) + 1)
         settled = False
         for _ in range(STEPS):
             tendon = self._tendon(middle, passed, poses)
@@ -214,33 +201,27 @@ class TendonEnd:
 
     def _string(self, poses: Mapping[str, Floats]) -> list[Floats]:
         """Legs of the string, each from one of its fixed points to the next."""
-        stops = [*self.other, *self.line]
-        return self._legs([_moved(*point, poses) for point in stops], stops, self._sides, poses)
+        return [self._leg(leg, side, poses) for leg, side in enumerate(self._sides)]
 
     def _tendon(self, middle: Floats, passed: int, poses: Mapping[str, Floats]) -> Floats:
         """The line from the belly's end to the insertion, without the via points that the end has
         passed.
         """
-        first = len(self.other) - 1 + passed
-        stops = [*self.other, *self.line][first:]
-        points = [middle, *(_moved(*point, poses) for point in stops[1:])]
-        legs = self._legs(points, stops, self._sides[first:], poses)
-        return np.concatenate([legs[0], *(leg[1:] for leg in legs[1:])])
+        first, *others = list(enumerate(self._sides))[len(self.other) - 1 + passed :]
+        rest = [self._leg(leg, side, poses)[1:] for leg, side in others]
+        return np.concatenate([self._leg(*first, poses, start=middle), *rest])
 
-    def _legs(
-        self,
-        points: Sequence[Floats],
-        stops: Sequence[BonePoint],
-        sides: Sequence[Floats],
-        poses: Mapping[str, Floats],
-    ) -> list[Floats]:
-        """Taut lines from one point to the next, whose sides turn half with the bone of either."""
+    def _leg(
+        self, leg: int, side: Floats, poses: Mapping[str, Floats], *, start: Floats | None = None
+    ) -> Floats:
+        """Taut line (n, 3) of one leg of the string, or of what is left of it from ``start``; its
+        side (3,) turns half with the bone of either end.
+        """
+        near, far = [*self.other, *self.line][leg : leg + 2]
+        start = _moved(*near, poses) if start is None else start
+        turned = (poses[near[0]][:3, :3] + poses[far[0]][:3, :3]) @ side
         bones = [(poses[bone.name], bone.surface_points) for bone in self.obstacles]
-        legs = []
-        for k, side in zip(range(len(points) - 1), sides):
-            turned = (poses[stops[k][0]][:3, :3] + poses[stops[k + 1][0]][:3, :3]) @ side
-            legs.append(taut_line(points[k], points[k + 1], turned, bones, self.radii[0]))
-        return legs
+        return taut_line(start, _moved(*far, poses), turned, bones, self.radii[0])
 
     def _turn(self, before: Floats, now: Floats, poses: Mapping[str, Floats]) -> Floats:
         """Rotation (3, 3) from one direction to the other; the twist between two fixed points is
@@ -322,17 +303,18 @@ def _moved(bone: str, point: Floats, poses: Mapping[str, Floats]) -> Floats:
     return poses[bone][:3, :3] @ point + poses[bone][:3, 3]
 
 
-def _mark(legs: Sequence[Floats], distance: float) -> _Mark:
-    """The point of a string at a distance along it from its end."""
+def _point_on(legs: Sequence[Floats], distance: float) -> tuple[Floats, Floats, int]:
+    """The point (3,) of a string at a distance along it from its end, the direction (3,) there, and
+    how many legs end before it.
+    """
     ends = np.cumsum([line_length(leg) for leg in legs])
     place, half = max(float(ends[-1]) - distance, 0.0), 0.5 * CHORD * float(ends[-1])
     point, behind, ahead = points_along(
         np.concatenate(legs), place + half * np.array([0.0, -1.0, 1.0])
     )
     chord = ahead - behind
-    return _Mark(
-        point, chord / max(float(np.linalg.norm(chord)), 1e-300), int((ends[:-1] <= place).sum())
-    )
+    direction = chord / max(float(np.linalg.norm(chord)), 1e-300)
+    return point, direction, int((ends[:-1] <= place).sum())
 
 
 def _least_turn(now: Floats, before: Floats) -> Floats:
