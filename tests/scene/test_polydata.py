@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import zlib
+from functools import cache
 
 import numpy as np
 import pytest
@@ -130,11 +131,8 @@ sys.stdout.buffer.write({{
         polydata._child.cache_clear()
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         with monkeypatch.context() as patch:
-            patch.setattr(
-                polydata,
-                "_start_child",
-                lambda *_: subprocess.Popen([sys.executable, "-c", code], **pipes),
-            )
+            child = cache(lambda _: subprocess.Popen([sys.executable, "-c", code], **pipes))
+            patch.setattr(polydata, "_child", child)
             assert_refused(path, capfd)
         assert not victim.exists()
         assert_is_ball(path)

@@ -55,7 +55,7 @@ def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
     """
     with _LOCK:
         child = _child(os.getpid())
-        assert child.stdin is not None  # _start_child asks for pipes
+        assert child.stdin is not None  # _child asks for pipes
         assert child.stdout is not None
         late = threading.Timer(PATIENCE, child.kill)
         late.daemon = True
@@ -77,11 +77,6 @@ def read_polydata(path: str | Path, *, array: str = "") -> PolyData:
             f"{path}: not a readable file of VTK PolyData ({found}); export the mesh again"
         )
     return found
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    _end_child(child)
-    _child.cache_clear()
 
 
 def _receive(pipe: IO[bytes]) -> PolyData | str:
@@ -118,30 +113,10 @@ def _read_whole(pipe: IO[bytes], size: int) -> bytes:
     return content
 
 
-def _reply(pipe: IO[bytes], *arrays: Array) -> None:
-    """Send arrays, which `_receive` takes; end the process where nobody reads."""
-    content = io.BytesIO()
-    for array in arrays:
-        np.save(content, array, allow_pickle=False)
-    try:
-        pipe.write(content.tell().to_bytes(_SIZE, "little"))
-        pipe.write(content.getvalue())
-        pipe.flush()
-    except BrokenPipeError:
-        os._exit(0)
-
-
 @cache
 def _child(process: int) -> subprocess.Popen[bytes]:
-    """The process that reads for the process of this number: none is shared after a fork."""
-    child = _start_child()
-    atexit.register(_end_child, child)
-    return child
-
-
-def _start_child() -> subprocess.Popen[bytes]:
-    """Start this module as a process with pipes and one thread for loops; modules in the present
-    folder are not imported.
+    """The process that reads for the process of this number, as none is shared after a fork: this
+    module with pipes and one thread for loops; modules in the present folder are not imported.
 
     It is started by command and not by `multiprocessing`, so that a script needs no guard of its
     main part.
@@ -152,11 +127,14 @@ def _start_child() -> subprocess.Popen[bytes]:
     environment |= dict.fromkeys(counts, "1")
     command, pipe = [sys.executable, "-P", "-m", __name__], subprocess.PIPE
     # A process group of its own: an interrupt reaches this process, which ends the child.
-    return subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
+    child = subprocess.Popen(command, env=environment, stdin=pipe, stdout=pipe, process_group=0)
+    atexit.register(_end, child)
+    return child
 
 
-def _end_child(process: subprocess.Popen[bytes]) -> None:
-    """End a process and close its pipes."""
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a process that reads and close its pipes; the next file is read by another."""
+    _child.cache_clear()
     process.kill()
     process.wait()
     for pipe in (process.stdin, process.stdout):
@@ -173,7 +151,9 @@ def _listen(asked: queue.Queue[list[str]]) -> None:
 
 
 def _answer() -> None:
-    """Take paths, and give what the files hold or why they cannot be read."""
+    """Take paths, and give what the files hold or why they cannot be read, as `_receive` takes it;
+    end where nobody reads.
+    """
     answers = os.fdopen(os.dup(1), "wb")
     for output in (1, 2):  # VTK prints pages
         os.dup2(os.open(os.devnull, os.O_WRONLY), output)
@@ -191,7 +171,15 @@ def _answer() -> None:
         except BROKEN_FILE as error:
             text = " ".join(str(error).split())[:200] or type(error).__name__
             arrays = (np.array(text),)
-        _reply(answers, *arrays)
+        content = io.BytesIO()
+        for part in arrays:
+            np.save(content, part, allow_pickle=False)
+        try:
+            answers.write(content.tell().to_bytes(_SIZE, "little"))
+            answers.write(content.getvalue())
+            answers.flush()
+        except BrokenPipeError:
+            os._exit(0)
 
 
 def _read(path: str, array: str) -> tuple[Array, ...]:

@@ -306,28 +306,28 @@ def _has_stl_length(content):
 
 def _read_stl_text(content):
     parts = []
-    begun = None
+    name, begun = "", None
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r", b"\n")
     if re.search(rb"vertex\s+\S*\d,\d", content, re.IGNORECASE):
         raise ValueError("its numbers have a decimal comma; write them with a point")
     for match in [*_SOLID.finditer(content), None]:
-        ends = match is not None and match[1] is not None
-        if begun is not None and not ends:
-            name = begun[2].strip().decode("utf-8", "replace")
-            raise ValueError(f"it is cut off: solid {name!r} has no end")
-        if begun is None and ends:
+        if match is None or match[1] is None:
+            if begun is not None:
+                raise ValueError(f"it is cut off: solid {name!r} has no end")
+            begun = match
+            name = "" if match is None else match[2].strip().decode("utf-8", "replace")
+            continue
+        if begun is None:
             raise ValueError("a solid ends that has not begun")
-        if ends:
-            name = begun[2].strip().decode("utf-8", "replace")
-            # A name may hold the words by which trimesh finds numbers.
-            inside = b"solid\n" + content[begun.end() : match.start()] + b"\nendsolid\n"
-            part = _read_solid(name, inside)
-            facets = len(re.findall(rb"\bendfacet\b", inside, re.IGNORECASE))
-            corners = len(re.findall(rb"\bvertex\b", inside, re.IGNORECASE))
-            if not corners == 3 * facets == 3 * len(part.faces):
-                raise ValueError(f"{corners} corners of {facets} triangles")
-            parts.append(part)
-        begun = None if ends else match
+        # A name may hold the words by which trimesh finds numbers.
+        inside = b"solid\n" + content[begun.end() : match.start()] + b"\nendsolid\n"
+        part = _read_solid(name, inside)
+        facets = len(re.findall(rb"\bendfacet\b", inside, re.IGNORECASE))
+        corners = len(re.findall(rb"\bvertex\b", inside, re.IGNORECASE))
+        if not corners == 3 * facets == 3 * len(part.faces):
+            raise ValueError(f"{corners} corners of {facets} triangles")
+        parts.append(part)
+        begun = None
     if not parts:
         raise ValueError("neither text from 'solid' to 'endsolid' nor binary")
     return parts
@@ -431,8 +431,9 @@ def _obj_lines(content):
     if numbers and max(numbers) >= len(points):
         wrong = next(k for k, vertex in enumerate(numbers) if vertex >= len(points))
         line = lines[int(np.searchsorted(ends, wrong, side="right")) - 1]
-        words = f"a face names vertex {numbers[wrong] + 1}, there are {len(points)}"
-        raise ValueError(f"line {line}: {words}")
+        raise ValueError(
+            f"line {line}: a face names vertex {numbers[wrong] + 1}, there are {len(points)}"
+        )
     return points, numbers, ends, labels, objects, other
 
 
@@ -520,20 +521,17 @@ class TransformParts(Table):
     rotate: Vector = Field(default=[0.0, 0.0, 0.0])
     translate: Vector = Field(default=[0.0, 0.0, 0.0])
 
-    def matrix(self) -> Floats:
-        """The transform (4, 4)."""
-        matrix = np.eye(4)
-        matrix[:3, :3] = Rotation.from_euler("xyz", self.rotate, degrees=True).as_matrix()
-        matrix[:3, 3] = self.translate
-        return matrix
-
 
 def _as_matrix(value: object) -> object:
     """Parts, or an array, as rows of a matrix."""
     if value is None:
         return None
     if isinstance(value, dict):
-        return TransformParts.build(value, context="").matrix().tolist()
+        parts = TransformParts.build(value, context="")
+        matrix = np.eye(4)
+        matrix[:3, :3] = Rotation.from_euler("xyz", parts.rotate, degrees=True).as_matrix()
+        matrix[:3, 3] = parts.translate
+        return matrix.tolist()
     try:
         matrix = np.array(value, dtype=float)
     except (TypeError, ValueError):
@@ -569,7 +567,7 @@ class MeshTransform(Table):
             matrix[:, AXES[self.mirror]] *= -1.0
         return matrix
 
-    def points(self, points: Floats) -> Floats:
+    def points(self, points: ArrayLike) -> Floats:
         """Points (n, 3) of a file, in the scene."""
         scaled, matrix = np.asarray(points, dtype=float) * self.scale, self.matrix
         return scaled if matrix is None else to_world(scaled, matrix)
@@ -599,22 +597,16 @@ def read_mesh(
     path = Path(path)
     part = read_part(path)
     read = prepare_mesh(
-        *_placed(part.vertices, part.faces, transform),
+        part.vertices,
+        part.faces,
         context=str(path),
         name=name or path.stem,
+        transform=transform,
         may_be_open=may_be_open,
     )
     read.notes[:0] = part.notes
     read.source = str(path)
     return read
-
-
-def _placed(vertices, faces, transform):
-    """Vertices and triangles of a file in the scene."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        vertices = transform.points(vertices)
-    mirrored = transform.matrix is not None and np.linalg.det(transform.matrix[:3, :3]) < 0.0
-    return vertices, faces[:, ::-1] if mirrored else faces
 
 
 def as_mesh(
@@ -632,25 +624,31 @@ def as_mesh(
     if isinstance(mesh, (str, Path)):
         return read_mesh(mesh, name=name, transform=transform, may_be_open=may_be_open)
     vertices, faces = mesh if isinstance(mesh, tuple) else (mesh.vertices, mesh.faces)
-    vertices, faces = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
     return prepare_mesh(
-        *_placed(vertices, faces, transform),
+        vertices,
+        faces,
         context=f"mesh {name!r}",
         name=name,
+        transform=transform,
         may_be_open=may_be_open,
     )
 
 
 def prepare_mesh(
-    vertices: Floats,
-    faces: Integers,
+    vertices: ArrayLike,
+    faces: ArrayLike,
     *,
     context: str,
     name: str,
+    transform: MeshTransform = IN_PLACE,
     may_be_open: bool = False,
 ) -> ReadMesh:
     """Return the ReadMesh of given arrays, mended like a file's; ``context`` begins messages."""
-    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    with np.errstate(over="ignore", invalid="ignore"):
+        vertices = transform.points(vertices)
+    faces = np.asarray(faces)
+    if transform.matrix is not None and np.linalg.det(transform.matrix[:3, :3]) < 0.0:
+        faces = faces[:, ::-1]
     if not len(vertices) or not len(faces):
         raise MeshError(
             f"{context}: the mesh is empty ({len(vertices)} vertices, {len(faces)} triangles)"
@@ -712,8 +710,16 @@ def read_fibres(
 
 
 def _read_lines(path, context):
+    """The lines of a VTK or VTP file, or the list in a JSON file."""
     if path.suffix.lower() in (".vtk", ".vtp"):
-        return _read_polylines(path, context)
+        if not path.is_file():
+            raise SceneError(f"{context}{path}: cannot read it: no such file")
+        try:
+            data = read_polydata(path)
+        except MeshError as error:
+            raise SceneError(f"{context}{error}") from None
+        pieces = np.split(data.line_numbers, data.line_ends[1:-1]) if len(data.line_ends) else []
+        return [data.points[piece] for piece in pieces if len(piece)]
     text = read_text(path, context=context)
     try:
         found = json.loads(text)
@@ -723,15 +729,3 @@ def _read_lines(path, context):
     if not isinstance(lines, list):
         raise SceneError(f"{context}{path}: needs a list 'polylines'")
     return lines
-
-
-def _read_polylines(path, context):
-    """The lines of a VTK or VTP file."""
-    if not path.is_file():
-        raise SceneError(f"{context}{path}: cannot read it: no such file")
-    try:
-        found = read_polydata(path)
-    except MeshError as error:
-        raise SceneError(f"{context}{error}") from None
-    pieces = np.split(found.line_numbers, found.line_ends[1:-1]) if len(found.line_ends) else []
-    return [found.points[piece] for piece in pieces if len(piece)]
