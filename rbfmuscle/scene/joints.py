@@ -83,11 +83,15 @@ class Curve:
         from scipy.interpolate import make_interp_spline
 
         x, y = np.array(self.x), np.array(self.y)
-        ends = None
+        ends = []
         if self.degree == 3 and len(x) > 3:  # three points: one parabola
-            cubics = (make_interp_spline(x[s], y[s]) for s in (np.s_[:4], np.s_[-4:]))
-            ends = tuple([(3, float(cubic(x[0], nu=3)))] for cubic in cubics)
-        curve = make_interp_spline(x, y, k=min(self.degree, len(x) - 1), bc_type=ends)
+            for four in (np.s_[:4], np.s_[-4:]):
+                difference = y[four]  # divided, in the end of third order
+                for order in (1, 2, 3):
+                    difference = np.diff(difference) / (x[four][order:] - x[four][:-order])
+                ends.append([(3, 6.0 * float(difference[0]))])
+        degree = min(self.degree, len(x) - 1)
+        curve = make_interp_spline(x, y, k=degree, bc_type=tuple(ends) or None)
         pieces = np.stack([curve(x, nu=n) / math.factorial(n) for n in (3, 2, 1, 0)], axis=1)
         straight = pieces * [0.0, 0.0, 1.0, 1.0]
         return np.stack([straight[0], *pieces[:-1], straight[-1]]).tolist()
@@ -118,9 +122,11 @@ class Multivariate:
 
     def rescaled(self, inputs: list[float], output: float) -> "Multivariate":
         """Return the function in other units."""
-        factors = [output / math.prod(map(pow, inputs, powers)) for _, *powers in self.terms]
         return Multivariate(
-            tuple((c * factor, *powers) for factor, (c, *powers) in zip(factors, self.terms))
+            tuple(
+                (c * (output / math.prod(map(pow, inputs, powers))), *powers)
+                for c, *powers in self.terms
+            )
         )
 
 
@@ -150,8 +156,8 @@ Z = (0.0, 0.0, 1.0)
 
 
 # All that is known of a kind stands here: the axes that its coordinates turn about, then those that
-# they shift along; files, code, messages and tests read this table. What a custom joint has is given
-# with it.
+# they shift along; files, code, messages and tests read this table. What a custom joint has is
+# given with it.
 Axes: TypeAlias = tuple[tuple[float, float, float], ...]
 KINDS: dict[str, tuple[Axes, Axes]] = {
     "weld": ((), ()),
@@ -302,11 +308,12 @@ def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]
     the last such axis deciding; else it is coupled. ``axes`` are the sort of each, its coordinates,
     and the first slope of its function where that is linear, else 0.
     """
-    found: MotionKind = "coupled"
-    for sort, coordinates, slope in axes:
-        if list(coordinates) == [name] and abs(slope) == 1.0:
-            found = sort
-    return found
+    own = [
+        sort
+        for sort, coordinates, slope in axes
+        if list(coordinates) == [name] and abs(slope) == 1.0
+    ]
+    return own[-1] if own else "coupled"
 
 
 def rotation_about(axis: ArrayLike, angle: float, centre: np.ndarray) -> np.ndarray:
@@ -394,16 +401,14 @@ def joint_poses(
     now = joint_values(joints, couplings, coordinates)
     rest = joint_values(joints, couplings, {})
     joint_of = {joint.child: joint for joint in joints}
-    poses = {}
-    for bone in bones:
-        chain, name = [], bone
-        while name in joint_of and name not in poses:
-            chain.append(joint_of[name])
-            name = chain[-1].parent
-        pose = poses.setdefault(name, np.eye(4))
-        for joint in reversed(chain):
-            pose = pose @ joint.motion(now[joint.name], rest[joint.name])
-            poses[joint.child] = pose
+    poses = {bone: np.eye(4) for bone in bones}
+    parents = {joint.child: [joint.parent] for joint in joints}
+    for bone in TopologicalSorter(parents).static_order():
+        poses[bone] = np.eye(4)
+        if bone in joint_of:
+            joint = joint_of[bone]
+            motion = joint.motion(now[joint.name], rest[joint.name])
+            poses[bone] = poses[joint.parent] @ motion
     return {bone: poses[bone] for bone in bones}
 
 
@@ -632,8 +637,9 @@ class JointTable(Table):
         """
         if kind == "custom":
             if self.axes:
-                words = "a custom joint has rotations and translations instead of axes"
-                raise SceneError(f"{context}: {words}")
+                raise SceneError(
+                    f"{context}: a custom joint has rotations and translations instead of axes"
+                )
             if len(self.rotations) + len(self.translations) > MOST_AXES:
                 raise SceneError(f"{context}: a custom joint has at most {MOST_AXES} axes")
             return {"rotation": self.rotations, "translation": self.translations}
@@ -646,8 +652,10 @@ class JointTable(Table):
         axes = self.axes or dict(zip(self.coordinates, usual))
         count = len(axes) or len(self.coordinates)
         if count != len(usual):
-            words = f"{len(usual)} coordinates, {count} are given; name them in axes"
-            raise SceneError(f"{context}: a {kind} joint has {words}")
+            raise SceneError(
+                f"{context}: a {kind} joint has {len(usual)} coordinates, {count} are given; name "
+                "them in axes"
+            )
         tables = [AxisTable(axis=list(axis), coordinates=[name]) for name, axis in axes.items()]
         return {"rotation": tables[: len(turns)], "translation": tables[len(turns) :]}
 
@@ -689,8 +697,12 @@ def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
 
 def joint_row(joint: Joint) -> dict[str, object]:
     """Return a joint as the plain table that makes it again [degree, scene unit]."""
-    row: dict[str, object] = {"name": joint.name, "parent": joint.parent, "child": joint.child}
-    row["type"] = joint.kind
+    row: dict[str, object] = {
+        "name": joint.name,
+        "parent": joint.parent,
+        "child": joint.child,
+        "type": joint.kind,
+    }
     if joint.kind != "weld":
         row["centre"] = joint.centre.tolist()
     if joint.kind == "custom":
@@ -748,10 +760,9 @@ def _function_row(function: Function, inputs: Sequence[str], output: str) -> dic
     function = function.rescaled(
         [1.0 / FACTORS[motion] for motion in inputs], 1.0 / FACTORS[output]
     )
-    if isinstance(function, Linear) and not function.slopes:
-        return {"constant": function.constant}
     if isinstance(function, Linear):
-        return {"linear": [*function.slopes, function.constant]}
+        linear = [*function.slopes, function.constant]
+        return {"linear": linear} if function.slopes else {"constant": function.constant}
     if isinstance(function, Polynomial):
         return {"polynomial": list(function.coefficients)}
     if isinstance(function, Multivariate):

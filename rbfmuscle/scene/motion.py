@@ -24,11 +24,8 @@ def rest_coordinates(scene: Scene) -> dict[str, float]:
     """Return the coordinates that follow no other and whose rest value is not zero [radian or scene
     unit].
     """
-    known = all_coordinates(scene.joints)
     followers = {coupling.coordinate for coupling in scene.couplings}
-    if not any(coordinate.rest for coordinate in known.values()):
-        return {}
-    rest = coordinate_values({}, known, scene.couplings)
+    rest = coordinate_values({}, all_coordinates(scene.joints), scene.couplings)
     return {name: value for name, value in rest.items() if value and name not in followers}
 
 
