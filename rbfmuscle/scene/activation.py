@@ -114,7 +114,8 @@ def activation_curve(muscle: Muscle, motion: Motion) -> Floats:
     given = 0.0 if muscle.contraction is None else muscle.contraction.activation
     if not isinstance(given, ActivationTable):
         values = np.atleast_1d(given)
-        return np.interp(motion.progress, np.linspace(0.0, 1.0, len(values)), values)
+        progress = motion.numbers / max(motion.whole - 1, 1)
+        return np.interp(progress, np.linspace(0.0, 1.0, len(values)), values)
     values = np.array(given.values)
     if given.frames is not None:
         return np.interp(motion.numbers, given.frames, values)

@@ -5,7 +5,6 @@ motion.
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -43,7 +42,7 @@ def input_overlaps(
 ) -> dict[tuple[str, str], InputOverlap]:
     """The pairs of muscles whose input meshes overlap, from `input_distances`."""
     found = {}
-    for one, other in combinations(distances, 2):
+    for one, other in itertools.combinations(distances, 2):
         depths = [
             distances[other].depth(distances[one].vertices),
             distances[one].depth(distances[other].vertices),
@@ -254,12 +253,15 @@ def check_scene(scene: Scene) -> list[Finding]:
     away, size = _far(scene)
     if away > FAR_SINGLE * size:
         error = away * float(np.finfo(np.float32).eps) / 2.0
-        said = (
-            f"it lies {away:.3g} {scene.units} from the origin: in files of single precision (STL, "
-            f"PLY, GLB) places are wrong by up to {error:.2g} {scene.units}; move it near the "
-            "origin"
+        findings.append(
+            Finding(
+                "warning",
+                scene.name,
+                f"it lies {away:.3g} {scene.units} from the origin: in files of single precision "
+                f"(STL, PLY, GLB) places are wrong by up to {error:.2g} {scene.units}; move it "
+                "near the origin",
+            )
         )
-        findings.append(Finding("warning", scene.name, said))
     findings += [Finding("warning", "motion", note) for note in scene.motion.notes]
     findings += _rest_overlaps(scene)
     overlaps = input_overlaps(input_distances(scene.muscles))
@@ -283,21 +285,27 @@ def check_scene(scene: Scene) -> list[Finding]:
         for guess in doubtful(scene.guesses, table)
     ]
     if scene.meshless_bones and not scene.bones:
-        words = "no bone has a mesh, so nothing can be run; give the bones meshes"
-        return sort_findings([*findings, Finding("note", scene.name, words)])
+        unrunnable = "no bone has a mesh, so nothing can be run; give the bones meshes"
+        return sort_findings([*findings, Finding("note", scene.name, unrunnable)])
     surfaces = scene_surfaces(scene)
     for muscle in scene.muscles:
         share, bone_name = articular_share(muscle, scene, surfaces)
         if share > MOST_ARTICULAR:
-            said = (
-                f"{100 * share:.0f} % of an attachment lies on an articular surface of "
-                f"{bone_name!r}; correct the attachment"
+            findings.append(
+                Finding(
+                    "warning",
+                    muscle.name,
+                    f"{100 * share:.0f} % of an attachment lies on an articular surface of "
+                    f"{bone_name!r}; correct the attachment",
+                )
             )
-            findings.append(Finding("warning", muscle.name, said))
     findings += [Finding("warning", name, text) for name, text in open_ends(scene).items()]
     try:
         findings += bone_findings(bone_collisions(scene), scene.units)
-        check_extents(scene)
+        for bone in scene.bones:
+            check_size("bone", bone.name, bone, scene.units)
+        for muscle in scene.muscles:
+            check_place(muscle.name, muscle, scene.bones, scene.units)
         require_complete(scene)
     except RBFMuscleError as error:
         findings.append(Finding("error", scene.name, str(error)))
@@ -380,14 +388,6 @@ def sort_findings(findings: Iterable[Finding]) -> list[Finding]:
     return sorted(findings, key=lambda finding: ("error", "warning", "note").index(finding.level))
 
 
-def check_extents(scene: Scene) -> None:
-    """Raise MeshError for a mesh whose size or place shows a wrong unit or another frame."""
-    for bone in scene.bones:
-        check_size("bone", bone.name, bone, scene.units)
-    for muscle in scene.muscles:
-        check_place(muscle.name, muscle, scene.bones, scene.units)
-
-
 def _rest_overlaps(scene):
     """Muscle vertices inside bones at rest."""
     findings = []
@@ -434,9 +434,21 @@ def bone_collisions(
     """
     found = []
     for frame in sampled_frames(scene) if frames is None else frames:
-        depths = _pair_depths(scene, bone_poses(scene, scene.motion.frames[frame]))
-        least = from_mm(COUNTED_DEPTH_MM, scene.units)
-        found += [(frame, *pair, depth) for pair, depth in depths.items() if depth > least]
+        poses = bone_poses(scene, scene.motion.frames[frame])
+        for first, second in itertools.combinations(scene.bones, 2):
+            relative = np.asarray(np.linalg.solve(poses[second.name], poses[first.name]), float)
+            if np.allclose(relative, np.eye(4), atol=1e-12):
+                continue
+            (low, high), other = moved_box(first.bounds, relative), second.bounds
+            if np.any(low > other[1]) or np.any(high < other[0]):
+                continue
+            back = np.asarray(np.linalg.inv(relative), float)
+            deepest = max(
+                second.exact.depth(first.mesh.vertices, pose=relative).max(),
+                first.exact.depth(second.mesh.vertices, pose=back).max(),
+            )
+            if deepest > from_mm(COUNTED_DEPTH_MM, scene.units):
+                found.append((frame, first.name, second.name, float(deepest)))
     return found
 
 
@@ -444,28 +456,6 @@ def sampled_frames(scene: Scene) -> list[int]:
     """About ten frames along a motion, the first and the last among them."""
     chosen = np.linspace(0, len(scene.motion) - 1, MOTION_SAMPLES).round().astype(int)
     return [int(frame) for frame in np.unique(chosen)]
-
-
-def _pair_depths(scene, poses):
-    """Deepest vertex of either bone in the other, for the pairs that move against each other and
-    overlap.
-    """
-    depths = {}
-    for first, second in itertools.combinations(scene.bones, 2):
-        relative = np.linalg.solve(poses[second.name], poses[first.name])
-        if np.allclose(relative, np.eye(4), atol=1e-12):
-            continue
-        back = np.linalg.inv(relative)
-        (low, high), other = moved_box(first.bounds, relative), second.bounds
-        if np.any(low > other[1]) or np.any(high < other[0]):
-            continue
-        deepest = max(
-            second.exact.depth(first.mesh.vertices, pose=relative).max(),
-            first.exact.depth(second.mesh.vertices, pose=back).max(),
-        )
-        if deepest > 0:
-            depths[first.name, second.name] = float(deepest)
-    return depths
 
 
 def bone_findings(collisions: list[tuple[int, str, str, float]], units: str) -> list[Finding]:
@@ -476,12 +466,12 @@ def bone_findings(collisions: list[tuple[int, str, str, float]], units: str) -> 
     for frame, first, second, depth in collisions:
         start, deepest = worst.get((first, second), (frame, 0.0))
         worst[first, second] = (start, max(deepest, depth))
-    said = "the motion drives the bones into each other"
     return [
         Finding(
             "warning",
             f"{a} and {b}",
-            f"{said}, from about frame {start}, up to {deepest:.3g} {units}",
+            f"the motion drives the bones into each other, from about frame {start}, up to "
+            f"{deepest:.3g} {units}",
         )
         for (a, b), (start, deepest) in worst.items()
     ]

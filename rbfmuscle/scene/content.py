@@ -42,13 +42,15 @@ def content(value: object) -> object:
         return {key: content(item) for key, item in value.items()}
     if isinstance(value, Sequence):
         return [content(item) for item in value]
-    if isinstance(value, BaseModel):
-        names = type(value).model_fields
-        return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
-    if is_dataclass(value):
+    if is_dataclass(value) or isinstance(value, BaseModel):
+        names = (
+            [each.name for each in fields(value)]
+            if is_dataclass(value)
+            else type(value).model_fields
+        )
         left = value.not_compared if isinstance(value, Compared) else ()
-        names = [each.name for each in fields(value) if each.name not in left]
-        return {"": type(value).__name__, **{name: content(getattr(value, name)) for name in names}}
+        found = {name: content(getattr(value, name)) for name in names if name not in left}
+        return {"": type(value).__name__, **found}
     if isinstance(value, trimesh.Trimesh):
         return mesh_hash(np.asarray(value.vertices), np.asarray(value.faces))
     raise TypeError(f"{type(value).__name__} is no part of a scene")

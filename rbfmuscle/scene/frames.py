@@ -35,15 +35,19 @@ def read_storage(
         (row for row, line in enumerate(lines) if line.strip().lower() == "endheader"), len(lines)
     )
     if len(lines) < end + 3:
-        words = "no 'endheader' line with columns and rows after it"
-        raise SceneError(f"{context}{path} is no OpenSim motion: {words}")
+        raise SceneError(
+            f"{context}{path} is no OpenSim motion: no 'endheader' line with columns and rows "
+            "after it"
+        )
     pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
     labels = [label.strip("\"'") for label in lines[end + 1].split()]
     rows = [line.split() for line in lines[end + 2 :] if line.strip()]
     for number, row in enumerate(rows, 1):
         if len(row) != len(labels):
-            words = f"row {number} has {len(row)} values, the header names {len(labels)}"
-            raise SceneError(f"{context}{path} {words}")
+            raise SceneError(
+                f"{context}{path} row {number} has {len(row)} values, the header names "
+                f"{len(labels)}"
+            )
     if not rows:
         raise SceneError(f"{context}{path} has no rows under its labels")
     try:
@@ -302,7 +306,11 @@ def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> 
 
 
 def _asked_frames(options, known):
-    """Frames of a ramp or of waypoints; the rest pose alone without either."""
+    """Frames of a ramp or of waypoints; the rest pose alone without either.
+
+    They go from stop to stop [degree or scene unit] in whole steps; the coordinate that needs most
+    sets the pace.
+    """
 
     def named(table):
         return {
@@ -311,30 +319,23 @@ def _asked_frames(options, known):
 
     if options.ramp is not None:
         ramps = named(options.ramp)
+        names = list(ramps)
+        steps = [ramp.step for ramp in ramps.values()]
         starts = {name: ramp.start for name, ramp in ramps.items() if ramp.start is not None}
         stops = [starts, {name: ramp.end for name, ramp in ramps.items()}]
-        return _frames_between(stops, list(ramps), [ramp.step for ramp in ramps.values()], known)
-    if options.waypoints is not None:
+    elif options.waypoints is not None:
         stops = [named(stop) for stop in options.waypoints]
+        steps = options.step or 1.0
         names = list(dict.fromkeys(itertools.chain(*stops)))
-        return _frames_between(stops, names, options.step or 1.0, known)
-    return [{}]
-
-
-def _frames_between(stops, names, steps, known):
-    """Frames from stop to stop [degree or scene unit] in whole steps; the coordinate that needs
-    most sets the pace.
-    """
-    table = np.array([[stop.get(name, np.nan) for name in names] for stop in stops]).reshape(
-        len(stops), -1
-    )
+    else:
+        return [{}]
     factors = np.array([FACTORS[known[name].motion] for name in names])
-    for column, name in enumerate(
-        names
-    ):  # what a stop does not mention stays where it was, at rest at first
-        held = known[name].rest / factors[column]
-        for row in range(len(stops)):
-            held = table[row, column] = held if np.isnan(table[row, column]) else table[row, column]
+    # What a stop does not mention stays where it was, at rest at first.
+    held = {name: known[name].rest / factor for name, factor in zip(names, factors)}
+    table = np.empty((len(stops), len(names)))
+    for row, stop in zip(table, stops):
+        held |= stop
+        row[:] = list(held.values())
     rows = [table[0]]
     with np.errstate(over="ignore"):
         paces = (np.abs(np.diff(table, axis=0)) / steps).max(axis=1, initial=0.0)

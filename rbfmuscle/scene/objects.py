@@ -119,11 +119,6 @@ class Motion(Compared):
             self.whole = len(self.frames)
 
     @property
-    def progress(self) -> Floats:
-        """Where each frame lies in the whole motion (n,), 0 to 1."""
-        return self.numbers / max(self.whole - 1, 1)
-
-    @property
     def coordinates(self) -> list[str]:
         """Names of the coordinates that change, the one with the widest range first."""
         names = sorted({name for frame in self.frames for name in frame})

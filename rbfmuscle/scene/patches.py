@@ -247,8 +247,7 @@ def select_vertices(
         painted = _painted(table.colour, Path(read.source), len(read.vertex_map), context)
         kept = read.vertex_map[painted]
         if not (kept >= 0).any():
-            words = f"no vertex has the colour {table.colour}, or one near to it"
-            raise SceneError(f"{context}{words}")
+            raise SceneError(f"{context}no vertex has the colour {table.colour}, or one near to it")
         return np.unique(kept[kept >= 0])
     if bone is None or not isinstance(table, AttachTable):
         raise TypeError("near belongs to an attachment and its bone")
@@ -318,6 +317,8 @@ def _listed(listed: Path | list[int], count: int, context: str) -> Integers:
         raise SceneError(f"{context}no vertex numbers")
     for number in numbers:
         if not 0 <= number < count:
-            words = f"out of range, the mesh has vertices 0 to {count - 1}"
-            raise SceneError(f"{context}vertex {shown(number)} is {words}")
+            raise SceneError(
+                f"{context}vertex {shown(number)} is out of range, the mesh has vertices 0 to "
+                f"{count - 1}"
+            )
     return np.array(numbers, dtype=np.int64)

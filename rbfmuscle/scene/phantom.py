@@ -235,8 +235,7 @@ def solid_mesh(
 
     low = np.asarray(low, dtype=float)
     shape = np.ceil((np.asarray(high) - low) / spacing).astype(int) + 1
-    axes = [low[k] + spacing * np.arange(shape[k]) for k in range(3)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    grid = low + spacing * np.moveaxis(np.indices(shape), 0, -1)
     vertices, faces, _, _ = marching_cubes(distance(grid), 0.0, spacing=(spacing,) * 3)
     vertices = vertices.astype(float) + low
     h = 1e-4 * spacing
