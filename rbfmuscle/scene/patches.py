@@ -51,13 +51,18 @@ def read_points(path: Path, *, context: str) -> Floats:
         [word.strip(" \"'") for word in re.split(r"[,;\t]|\s+", line.strip())] for line in lines
     ]
     columns = [0, 1, 2]
-    if lines and not _is_number(rows[0][0]):
-        head = [word.strip(" \"'").lower() for word in re.split(r"[,;\t]", lines[0].strip())]
-        head = rows[0] if len(head) == 1 else head
-        found = [next((k for k, word in enumerate(head) if word.lower() in a), -1) for a in _AXES]
-        if min(found) < 0:
-            raise SceneError(f"{context}no columns x, y and z in {shown(repr(lines[0]))}")
-        columns, rows = found, rows[1:]
+    if lines:
+        try:
+            float(rows[0][0])
+        except ValueError:  # names of columns, which may hold blanks
+            head = [word.strip(" \"'") for word in re.split(r"[,;\t]", lines[0].strip())]
+            head = [word.lower() for word in (rows[0] if len(head) == 1 else head)]
+            columns = [next((k for k, word in enumerate(head) if word in a), -1) for a in _AXES]
+            rows = rows[1:]
+            if min(columns) < 0:
+                raise SceneError(
+                    f"{context}no columns x, y and z in {shown(repr(lines[0]))}"
+                ) from None
     try:
         points = np.array([[float(row[k]) for k in columns] for row in rows])
     except (ValueError, IndexError):
@@ -65,14 +70,6 @@ def read_points(path: Path, *, context: str) -> Floats:
     if not len(points) or not np.isfinite(points).all():
         raise SceneError(f"{context}{len(points)} points, all must be finite")
     return points
-
-
-def _is_number(word):
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
 
 
 def picked_vertices(points: Floats, vertices: Floats, *, context: str) -> Integers:

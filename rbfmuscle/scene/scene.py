@@ -329,8 +329,9 @@ class Scene(Compared):
             Then applied; a dict holds ``rotate`` and ``translate``, as in ``[[bone]]``.
         """
         check_new_name(self.bones, name, "bone")
-        given = {"scale": scale, "mirror": mirror, "transform": transform}
-        lies = MeshTransform.build(given, context=f"bone {name!r}: ")
+        lies = MeshTransform.build(
+            {"scale": scale, "mirror": mirror, "transform": transform}, context=f"bone {name!r}: "
+        )
         if name in self.meshless_bones:
             raise SceneError(f"bone {name!r} is given twice")
         if mesh is None:
@@ -367,8 +368,14 @@ class Scene(Compared):
             ``rotations``, ...
         """
         if isinstance(joint, str):
-            row = {"name": joint, "parent": parent, "child": child, "centre": centre, **keys}
-            row["axes"] = axes and dict(axes)
+            row = {
+                "name": joint,
+                "parent": parent,
+                "child": child,
+                "centre": centre,
+                "axes": axes and dict(axes),
+                **keys,
+            }
             joint = JointTable.build(row, context=f"joint {joint!r}: ").joint()
         check_new_name(self.joints, joint.name, "joint")
         for bone in (joint.parent, joint.child):

@@ -145,7 +145,11 @@ class TendonEnd:
         """
         at_rest, before, along_before = self._rest
         legs = self._string(poses)
-        length = self.length * (1.0 + self._strain(sum(map(line_length, legs)) - at_rest))
+        longer = sum(map(line_length, legs)) - at_rest
+        tendons = self.length + self.opposite_length
+        belly = max(at_rest - tendons, 0.0)
+        strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
+        length = self.length * (1.0 + min(max(strain, 0.0), TENDON_STRAIN))
         now, along_now, ended = _point_on(legs, length)
         turn = self._turn(along_before, along_now, poses)
         middle = now + turn @ (self.middle - before)
@@ -191,13 +195,6 @@ class TendonEnd:
     def _rest_depths(self) -> list[Floats]:
         """Depth (n,) of the patch in each obstacle at rest."""
         return [_depths(bone, self.patch) for bone in self.obstacles]
-
-    def _strain(self, longer: float) -> float:
-        """The tendon's strain where the string is longer than at rest by so much."""
-        tendons = self.length + self.opposite_length
-        belly = max(self._rest[0] - tendons, 0.0)
-        strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
-        return min(max(strain, 0.0), TENDON_STRAIN)
 
     def _string(self, poses: Mapping[str, Floats]) -> list[Floats]:
         """Legs of the string, each from one of its fixed points to the next."""

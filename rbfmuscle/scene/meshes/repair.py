@@ -112,9 +112,15 @@ def repair(
         arrays = kept["vertices"], kept["faces"], kept["vertex_map"]
         return ReadMesh(*arrays, notes, str(kept["doubt"]), closed=bool(kept["closed"]))
     state = _mend(vertices, faces, context=context, may_be_open=may_be_open)
-    names = ("vertices", "faces", "vertex_map", "closed", "doubt")
-    found = {name: getattr(state, name) for name in names}
-    store_arrays(key, {**found, "notes": "\n".join(state.notes)})
+    found = {
+        "vertices": state.vertices,
+        "faces": state.faces,
+        "vertex_map": state.vertex_map,
+        "closed": state.closed,
+        "doubt": state.doubt,
+        "notes": "\n".join(state.notes),
+    }
+    store_arrays(key, found)
     return state
 
 
