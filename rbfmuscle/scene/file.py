@@ -21,7 +21,6 @@ from rbfmuscle.scene.joints import CouplingTable, JointTable
 from rbfmuscle.scene.meshes.read import MeshTransform
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.options import (
-    KEYS,
     Axis,
     ContactOptions,
     ContractionTable,
@@ -361,11 +360,6 @@ class ClassTable(ContractionTable, MeshTransform):
     attach: list[AttachTable] = Field(default_factory=list)
     fibres: FileName | None = None
     aponeuroses: AponeurosesTable | None = None
-
-    @property
-    def contraction(self) -> dict[str, object]:
-        """The keys of a muscle that contracts, those that are given."""
-        return {key: getattr(self, key) for key in KEYS if key in self.model_fields_set}
 
 
 class MuscleTable(ClassTable):

@@ -610,7 +610,8 @@ class JointTable(Table):
         def axis(motion, number, table):
             inputs = [coordinates[name].motion for name in table.coordinates]
             function = table.function(inputs, motion, context=f"{context}: {motion} {number}")
-            return TransformAxis(unit(table.axis), tuple(table.coordinates), function)
+            direction = tuple(value / math.hypot(*table.axis) for value in table.axis)
+            return TransformAxis(direction, tuple(table.coordinates), function)
 
         turns, shifts = (
             tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
@@ -665,12 +666,6 @@ class CouplingTable(FunctionTable):
 
     coordinate: str
     of: list[str] = Field(min_length=1)
-
-
-def unit(axis: list[float]) -> tuple[float, float, float]:
-    """Return an axis (3,), not zero, at length one."""
-    x, y, z = (value / math.hypot(*axis) for value in axis)
-    return x, y, z
 
 
 def full_name(name: str, known: list[str], *, context: str) -> str:

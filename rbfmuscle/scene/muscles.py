@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import TypeAlias
 
@@ -32,7 +31,7 @@ from rbfmuscle.scene.objects import (
     find_named,
     split_model,
 )
-from rbfmuscle.scene.options import ActivationTable
+from rbfmuscle.scene.options import KEYS, ActivationTable
 from rbfmuscle.scene.patches import AponeurosesTable, AttachTable, select_vertices
 from rbfmuscle.scene.tendons import TendonEnd, tendon_name
 from rbfmuscle.validation import MeshError, SceneError
@@ -83,7 +82,7 @@ def attachment_ends(
     def away(one: str, other: str) -> float:
         return float(np.linalg.norm(middle[one] - middle[other]))
 
-    first, last = max(combinations(groups, 2), key=lambda pair: away(*pair))
+    first, last = max(itertools.combinations(groups, 2), key=lambda pair: away(*pair))
     to_last = {body: away(body, last) < away(body, first) for body in groups}
     return (
         [a for body, group in groups.items() if not to_last[body] for a in group],
@@ -120,7 +119,7 @@ def make_muscle(
         None if fibres is None else read_fibres(fibres, transform=placed, muscle=name),
         read.source,
         read.notes,
-        contraction_keys(placed.contraction, muscle=name),
+        contraction_keys({key: given[key] for key in KEYS if key in given}, muscle=name),
         given=read.given,
         aponeuroses=resolve_aponeuroses(aponeuroses, read, muscle=name, transform=placed),
     )

@@ -447,15 +447,11 @@ def _obj_vertex(word, count):
 
 def _joined_lines(content):
     """Number and text of each line, those that a backslash continues as one."""
-    lines = content.splitlines()
-    number = 0
-    while number < len(lines):
-        first, line = number + 1, lines[number]
-        while line.endswith(b"\\") and number + 1 < len(lines):
-            number += 1
-            line = line[:-1] + b" " + lines[number]
-        number += 1
-        yield first, line
+    text = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n").removesuffix(b"\n")
+    number = 1
+    for line in re.split(rb"(?<!\\)\n", text):
+        yield number, line.replace(b"\\\n", b" ")
+        number += 1 + line.count(b"\n")
 
 
 def _read_ply(path, content):

@@ -266,7 +266,9 @@ def _merge_equal(state):
     merged = np.arange(len(state.vertices))
     merged[used] = used[first[inverse.ravel()]]
     new = _merged_faces(faces, merged)
-    if _is_closed(faces) and not (_is_closed(new) and _euler(new) == _euler(faces)):
+    # A closed surface stays one of the same Euler characteristic.
+    euler = len(used) - len(faces) / 2
+    if _is_closed(faces) and not (_is_closed(new) and len(np.unique(new)) - len(new) / 2 == euler):
         return
     border, apart = _border(new), 0.0
     for tolerance in WIDER_TOLERANCES if border else ():
@@ -304,11 +306,6 @@ def _merged_faces(faces, merged):
 def _border(faces):
     """Number of edges of one face alone."""
     return int((_edges(faces)[1] == 1).sum())
-
-
-def _euler(faces):
-    """Euler characteristic of a closed surface."""
-    return len(np.unique(faces)) - len(faces) / 2
 
 
 def _drop_fins(state):
