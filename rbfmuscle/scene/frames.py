@@ -42,31 +42,26 @@ def read_storage(
     pairs = [line.lower().split("=", 1) for line in lines[:end] if "=" in line]
     labels = [label.strip("\"'") for label in lines[end + 1].split()]
     rows = [line.split() for line in lines[end + 2 :] if line.strip()]
+    if not rows:
+        raise SceneError(f"{context}{path} has no rows under its labels")
+    numbers = []
     for number, row in enumerate(rows, 1):
         if len(row) != len(labels):
             raise SceneError(
                 f"{context}{path} row {number} has {len(row)} values, the header names "
                 f"{len(labels)}"
             )
-    if not rows:
-        raise SceneError(f"{context}{path} has no rows under its labels")
-    try:
-        values = np.array(rows, dtype=float)
-    except ValueError:
-        raise SceneError(f"{context}{path} {_first_text(rows, labels)}") from None
-    return {key.strip(): value.strip() for key, value in pairs}, labels, values
-
-
-def _first_text(rows: list[list[str]], labels: list[str]) -> str:
-    """Where the first value stands that is no number, and what to do."""
-    for number, row in enumerate(rows, 1):
         for label, text in zip(labels, row):
             try:
-                float(text)
+                numbers.append(float(text))
             except ValueError:
                 more = "; part columns by tabs and write decimal points" if "," in text else ""
-                return f"row {number}: {shown(label)} is {shown(repr(text))}, not a number{more}"
-    return "has rows that are no numbers"
+                raise SceneError(
+                    f"{context}{path} row {number}: {shown(label)} is "
+                    f"{shown(repr(text))}, not a number{more}"
+                ) from None
+    header = {key.strip(): value.strip() for key, value in pairs}
+    return header, labels, np.array(numbers).reshape(len(rows), len(labels))
 
 
 TURN = 2.0 * math.pi  # [radian]

@@ -301,17 +301,19 @@ class Coupling:
     function: Function
 
 
-def motion_of(name: str, axes: Iterable[tuple[MotionKind, Sequence[str], float]]) -> MotionKind:
+def motion_of(name: str, axes: Iterable[tuple[MotionKind, TransformAxis]]) -> MotionKind:
     """What a coordinate of a custom joint is, by OpenSim's rule.
 
-    It is an angle or a length where it alone drives an axis of that sort with a slope of 1 or -1,
-    the last such axis deciding; else it is coupled. ``axes`` are the sort of each, its coordinates,
-    and the first slope of its function where that is linear, else 0.
+    It is an angle or a length where it alone drives an axis of that sort by a linear function with
+    a slope of 1 or -1, the last such axis deciding; else it is coupled. ``axes`` are the sort of
+    each and the axis.
     """
     own = [
         sort
-        for sort, coordinates, slope in axes
-        if list(coordinates) == [name] and abs(slope) == 1.0
+        for sort, axis in axes
+        if axis.coordinates == (name,)
+        and isinstance(axis.function, Linear)
+        and axis.function.slopes in ((1.0,), (-1.0,))
     ]
     return own[-1] if own else "coupled"
 
@@ -484,45 +486,35 @@ class FunctionTable(Table):
     piecewise: PointsTable | None = None
     spline: PointsTable | None = None
 
-    def function(self, inputs: Sequence[str], output: str, *, context: str) -> Function:
-        """Return the function in inner units; ``inputs`` and ``output`` are kinds of motion, keys
-        of `FACTORS`.
-        """
+    def function(self, count: int, *, context: str) -> Function:
+        """Return the function of ``count`` coordinates in the units of files."""
         given = [name for name in FUNCTIONS if getattr(self, name) is not None]
-        count, points = len(inputs), self.piecewise or self.spline
+        points = self.piecewise or self.spline
         if len(given) > 1:
             raise SceneError(f"{context}: give one function, not {' and '.join(given)}")
-        found: Function
         if self.constant is not None:
-            found = Linear((), self.constant)
-        elif count != 1 and (self.polynomial or points):
+            return Linear((), self.constant)
+        if count != 1 and (self.polynomial or points):
             raise SceneError(f"{context}: {given[0]} is of 1 coordinate, {count} are given")
-        elif self.polynomial is not None:
-            found = Polynomial(tuple(self.polynomial))
-        elif self.terms is not None:
+        if self.polynomial is not None:
+            return Polynomial(tuple(self.polynomial))
+        if points is not None:
+            return Curve(tuple(points.x), tuple(points.y), 3 if self.spline else 1)
+        if self.terms is not None:
             for term in self.terms:
                 if len(term) != count + 1 or any(power < 0 or power % 1 for power in term[1:]):
                     raise SceneError(
                         f"{context}: each of terms is a coefficient and the whole powers of "
                         f"{count} coordinates, got {term}"
                     )
-            found = Multivariate(tuple((c, *map(int, powers)) for c, *powers in self.terms))
-        elif points is not None:
-            found = Curve(tuple(points.x), tuple(points.y), 3 if self.spline else 1)
-        else:
-            *slopes, constant = self.linear or [1.0, 0.0]
-            if len(slopes) != count:
-                raise SceneError(
-                    f"{context}: linear needs a slope for each of {count} coordinates and a "
-                    f"constant, got {self.linear}"
-                )
-            found = Linear(tuple(slopes), constant)
-        return found.rescaled([FACTORS[motion] for motion in inputs], FACTORS[output])
-
-    def slope(self) -> float:
-        """The first slope of a linear function, 0 of any other."""
-        plain = all(getattr(self, name) is None for name in FUNCTIONS)
-        return 1.0 if plain else (self.linear or [0.0])[0]
+            return Multivariate(tuple((c, *map(int, powers)) for c, *powers in self.terms))
+        *slopes, constant = self.linear or [1.0, 0.0]
+        if len(slopes) != count:
+            raise SceneError(
+                f"{context}: linear needs a slope for each of {count} coordinates and a "
+                f"constant, got {self.linear}"
+            )
+        return Linear(tuple(slopes), constant)
 
 
 class AxisTable(FunctionTable):
@@ -592,39 +584,36 @@ class JointTable(Table):
             raise SceneError(f"{context}: centre is missing, give the joint's place at rest")
         if (self.radii or self.arc) and (kind != "custom" or len(self.rotations) != 3):
             raise SceneError(f"{context}: radii and arc need type 'custom' with three rotations")
-        groups = self._axes_of_kind(kind, context)
-        tables = [(sort, table) for sort, group in groups.items() for table in group]
-        named = dict.fromkeys(name for _, table in tables for name in table.coordinates)
+        axes = []
+        for sort, tables in self._axes_of_kind(kind, context).items():
+            for number, row in enumerate(tables, 1):
+                function = row.function(len(row.coordinates), context=f"{context}: {sort} {number}")
+                direction = tuple(value / math.hypot(*row.axis) for value in row.axis)
+                axes.append((sort, TransformAxis(direction, tuple(row.coordinates), function)))
+        named = dict.fromkeys(name for _, axis in axes for name in axis.coordinates)
         for name in self.coordinates:
             if name not in named:
                 hint = did_you_mean(name, list(named))
                 raise SceneError(f"{context}: coordinate {name!r} moves nothing, {hint}")
-        slopes = [(sort, table.coordinates, table.slope()) for sort, table in tables]
         coordinates = {}
         for name in named:
-            motion, table = motion_of(name, slopes), self.coordinates.get(name, CoordinateTable())
+            motion, table = motion_of(name, axes), self.coordinates.get(name, CoordinateTable())
             if kind != "custom" and table.motion not in (None, motion):
                 raise SceneError(f"{context}: {name!r} is a {motion} here, not a {table.motion}")
             coordinates[name] = table.coordinate(motion)
-
-        def axis(motion, number, table):
-            inputs = [coordinates[name].motion for name in table.coordinates]
-            function = table.function(inputs, motion, context=f"{context}: {motion} {number}")
-            direction = tuple(value / math.hypot(*table.axis) for value in table.axis)
-            return TransformAxis(direction, tuple(table.coordinates), function)
-
-        turns, shifts = (
-            tuple(axis(motion, number, table) for number, table in enumerate(group, 1))
-            for motion, group in groups.items()
-        )
+        moves: dict[MotionKind, list[TransformAxis]] = {"rotation": [], "translation": []}
+        for sort, axis in axes:
+            units = [FACTORS[coordinates[name].motion] for name in axis.coordinates]
+            function = axis.function.rescaled(units, FACTORS[sort])
+            moves[sort].append(replace(axis, function=function))
         return Joint(
             self.name,
             self.parent,
             self.child,
             np.array(self.centre or (0.0, 0.0, 0.0)),
             coordinates,
-            turns,
-            shifts,
+            tuple(moves["rotation"]),
+            tuple(moves["translation"]),
             kind,
             self.backward,
             None if self.radii is None else tuple(self.radii),
@@ -685,9 +674,9 @@ def make_coupling(table: CouplingTable, joints: list[Joint]) -> Coupling:
     target = full_name(table.coordinate, known, context="coupling")
     context = f"coupling of {target!r}"
     of = tuple(full_name(name, known, context=context) for name in table.of)
-    motions = [coordinates[name].motion for name in of]
-    function = table.function(motions, coordinates[target].motion, context=context)
-    return Coupling(target, of, function)
+    units = [FACTORS[coordinates[name].motion] for name in of]
+    function = table.function(len(of), context=context)
+    return Coupling(target, of, function.rescaled(units, FACTORS[coordinates[target].motion]))
 
 
 def joint_row(joint: Joint) -> dict[str, object]:

@@ -161,7 +161,6 @@ def split_model(model: object, *, context: str) -> tuple[str, dict[str, object]]
     raise SceneError(f"{context}: model must be a name or a table with a name, got {shown(model)}")
 
 
-_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 # Devices on Windows, in any case and with any ending: no file can have such a name.
 DEVICES = {"con", "prn", "aux", "nul"} | {
     f"{kind}{k}" for kind in ("com", "lpt") for k in range(10)
@@ -211,7 +210,7 @@ def find_named(items: Sequence[NamedItem], name: str, what: str, *, context: str
 
 def check_name(name: object, what: str) -> str:
     """Return the name, or raise SceneError if it is no name for a file."""
-    if not isinstance(name, str) or not name or not set(name) <= _CHARACTERS:
+    if not isinstance(name, str) or not re.fullmatch("[A-Za-z0-9_-]+", name):
         raise SceneError(
             f"{what} name {shown(repr(name))} may hold "
             "letters, digits, '_' and '-' only (it becomes a file name)"

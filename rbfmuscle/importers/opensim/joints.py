@@ -184,14 +184,10 @@ def _radii(node, tag):
 def _finish(reading, joint, found, plain):
     """Give a joint its coordinates, by scene names; the file's names of those that it uses."""
     groups = {"rotation": joint.rotations, "translation": joint.translations}
-    slopes = [
-        (sort, axis.coordinates, next(iter(getattr(axis.function, "slopes", ())), 0.0))
-        for sort, group in groups.items()
-        for axis in group
-    ]
-    used = [name for name in plain if any(name in names for _, names, _ in slopes)]
+    axes = [(sort, axis) for sort, group in groups.items() for axis in group]
+    used = [name for name in plain if any(name in axis.coordinates for _, axis in axes)]
     for name in used:
-        motion = motion_of(name, slopes)
+        motion = motion_of(name, axes)
         element = found.get(name)
         joint.coordinates[plain[name]] = (
             Coordinate(motion) if element is None else _coordinate(element, motion, reading.model)

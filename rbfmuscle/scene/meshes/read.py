@@ -506,7 +506,6 @@ def read_vertex_array(path: Path, name: str) -> Floats:
 
 FLAT = 1e-9  # least determinant of a transform, over the cube of its largest entry
 TransformInput: TypeAlias = ArrayLike | Mapping[str, Sequence[float]] | None
-AXES = {"x": 0, "y": 1, "z": 2}
 
 
 class TransformParts(Table):
@@ -560,7 +559,7 @@ class MeshTransform(Table):
             return None
         matrix = np.eye(4) if self.transform is None else np.array(self.transform)
         if self.mirror is not None:
-            matrix[:, AXES[self.mirror]] *= -1.0
+            matrix[:, "xyz".index(self.mirror)] *= -1.0
         return matrix
 
     def points(self, points: ArrayLike) -> Floats:
