@@ -55,8 +55,9 @@ def _read_activation(given: ActivationTable, muscle: str) -> ActivationTable:
     column = next((labels.index(form) for form in forms if form in labels), -1)
     if column < 0 or "time" not in labels:
         wanted = name if column < 0 else "time"
-        hint = did_you_mean(wanted, labels)
-        raise SceneError(f"{context}{given.file} has no column {wanted!r}, {hint}")
+        raise SceneError(
+            f"{context}{given.file} has no column {wanted!r}, {did_you_mean(wanted, labels)}"
+        )
     values = {
         "times": rows[:, labels.index("time")].tolist(),
         "values": rows[:, column].tolist(),

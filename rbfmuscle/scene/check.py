@@ -43,15 +43,12 @@ def input_overlaps(
     """The pairs of muscles whose input meshes overlap, from `input_distances`."""
     found = {}
     for one, other in itertools.combinations(distances, 2):
-        depths = [
-            distances[other].depth(distances[one].vertices),
-            distances[one].depth(distances[other].vertices),
-        ]
-        inside = [depth > 0.0 for depth in depths]
-        if any(each.any() for each in inside):
-            places = [distances[n].vertices[i] for n, i in zip((one, other), inside)]
-            deep = [depth[i] for depth, i in zip(depths, inside)]
-            found[one, other] = InputOverlap(np.concatenate(places), np.concatenate(deep))
+        pair = distances[one], distances[other]
+        vertices = np.concatenate([each.vertices for each in pair])
+        depths = np.concatenate([pair[1].depth(pair[0].vertices), pair[0].depth(pair[1].vertices)])
+        inside = depths > 0.0
+        if inside.any():
+            found[one, other] = InputOverlap(vertices[inside], depths[inside])
     return found
 
 

@@ -412,8 +412,10 @@ def _with_class(muscle: MuscleTable, classes: dict[str, ClassTable], context: st
     """
     name = muscle.class_
     if name != MAIN and name not in classes:
-        hint = did_you_mean(name, classes)
-        raise SceneError(f"{context}muscle {muscle.name!r}: unknown class {name!r}, {hint}")
+        raise SceneError(
+            f"{context}muscle {muscle.name!r}: unknown class {name!r}, "
+            f"{did_you_mean(name, classes)}"
+        )
     named = [classes[key] for key in dict.fromkeys((MAIN, name)) if key in classes]
     given: dict[str, object] = {"model": "rbf"}
     for table in (*named, muscle):

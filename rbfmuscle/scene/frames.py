@@ -288,8 +288,12 @@ def parse_slice(text: str) -> slice:
 def pick_frames(motion: Motion, chosen: Sequence[int]) -> Motion:
     """Return the motion of some frames, in the order in which their places are given."""
     times = None if motion.times is None else [motion.times[k] for k in chosen]
-    frames = [motion.frames[k] for k in chosen]
-    return replace(motion, frames=frames, times=times, numbers=motion.numbers[list(chosen)])
+    return replace(
+        motion,
+        frames=[motion.frames[k] for k in chosen],
+        times=times,
+        numbers=motion.numbers[list(chosen)],
+    )
 
 
 def interpolate(before: dict[str, float], after: dict[str, float], t: float) -> dict[str, float]:

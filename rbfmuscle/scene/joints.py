@@ -86,10 +86,10 @@ class Curve:
         ends = []
         if self.degree == 3 and len(x) > 3:  # three points: one parabola
             for four in (np.s_[:4], np.s_[-4:]):
-                difference = y[four]  # divided, in the end of third order
-                for order in (1, 2, 3):
-                    difference = np.diff(difference) / (x[four][order:] - x[four][:-order])
-                ends.append([(3, 6.0 * float(difference[0]))])
+                divided = y[four]
+                for order in (1, 2, 3):  # divided differences up to the third
+                    divided = np.diff(divided) / (x[four][order:] - x[four][:-order])
+                ends.append([(3, 6.0 * float(divided[0]))])
         degree = min(self.degree, len(x) - 1)
         curve = make_interp_spline(x, y, k=degree, bc_type=tuple(ends) or None)
         pieces = np.stack([curve(x, nu=n) / math.factorial(n) for n in (3, 2, 1, 0)], axis=1)
@@ -593,8 +593,9 @@ class JointTable(Table):
         named = dict.fromkeys(name for _, axis in axes for name in axis.coordinates)
         for name in self.coordinates:
             if name not in named:
-                hint = did_you_mean(name, list(named))
-                raise SceneError(f"{context}: coordinate {name!r} moves nothing, {hint}")
+                raise SceneError(
+                    f"{context}: coordinate {name!r} moves nothing, {did_you_mean(name, named)}"
+                )
         coordinates = {}
         for name in named:
             motion, table = motion_of(name, axes), self.coordinates.get(name, CoordinateTable())

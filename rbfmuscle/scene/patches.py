@@ -236,8 +236,7 @@ def select_vertices(
     if table.points is not None:
         return _about(table.points, table.radius, points, context)
     if table.region is not None:
-        place = transform, table.colour
-        return region_vertices(table.region, *place, read.mesh, context=context)
+        return region_vertices(table.region, transform, table.colour, read.mesh, context=context)
     if table.colour is not None:
         if not read.source:
             raise SceneError(f"{context}a colour needs a mesh that was read from a file")

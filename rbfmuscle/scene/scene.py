@@ -232,8 +232,7 @@ class Scene(Compared):
         """
         from rbfmuscle.importers.volumes import scene_from_labels
 
-        names = None if labels is None else Path(labels)
-        return scene_from_labels(Path(path), labels=names)
+        return scene_from_labels(Path(path), labels=None if labels is None else Path(labels))
 
     @classmethod
     def from_osim(
@@ -529,8 +528,9 @@ def require_complete(scene: Scene) -> Scene:
     known = all_coordinates(scene.joints)
     for name in (name for frame in scene.motion.frames for name in frame):
         if name not in known:
-            hint = did_you_mean(name, sorted(known))
-            raise SceneError(f"[motion]: unknown coordinate {name!r}, {hint}")
+            raise SceneError(
+                f"[motion]: unknown coordinate {name!r}, {did_you_mean(name, sorted(known))}"
+            )
     for muscle in scene.muscles:
         with _naming(muscle.name):
             check_muscle(muscle, scene.motion)

@@ -116,8 +116,9 @@ def _change_motion(values, rest, value, context):
         name, _, last = rest.removeprefix("ramp.").rpartition(".")
         ramps = values.setdefault("ramp", {})
         if name not in ramps:
-            hint = did_you_mean(name, ramps)
-            raise SceneError(f"{context}: the motion has no ramp {name!r}, {hint}")
+            raise SceneError(
+                f"{context}: the motion has no ramp {name!r}, {did_you_mean(name, ramps)}"
+            )
         ramps[name][last] = value
     else:
         values[rest] = value

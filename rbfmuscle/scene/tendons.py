@@ -183,8 +183,7 @@ class TendonEnd:
         points = (self.patch - self.middle) @ turn.T + middle
         deepest = 0.0
         for bone, at_rest in zip(self.obstacles, self._rest_depths):
-            pose = poses[bone.name]
-            local = to_local(points, pose)
+            local = to_local(points, poses[bone.name])
             deepest = max(deepest, float((_depths(bone, local) - at_rest).max()))
         near, far = (poses[bone][:3, :3] for bone, _ in (self.other[-1], self.line[0]))
         side = (near + far) @ self._sides[len(self.other) - 1]

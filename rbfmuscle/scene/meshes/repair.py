@@ -109,8 +109,14 @@ def repair(
     kept = load_arrays(key)
     if kept is not None:
         notes = [note for note in str(kept["notes"]).split("\n") if note]
-        arrays = kept["vertices"], kept["faces"], kept["vertex_map"]
-        return ReadMesh(*arrays, notes, str(kept["doubt"]), closed=bool(kept["closed"]))
+        return ReadMesh(
+            kept["vertices"],
+            kept["faces"],
+            kept["vertex_map"],
+            notes,
+            str(kept["doubt"]),
+            closed=bool(kept["closed"]),
+        )
     state = _mend(vertices, faces, context=context, may_be_open=may_be_open)
     found = {
         "vertices": state.vertices,
