@@ -338,8 +338,10 @@ FIBRE_POINTS = 15
 
 
 @functools.cache
-def _parts(spacing):
-    """Meshes, attachments and fibres, computed once; nobody may change them in place."""
+def _muscles(spacing):
+    """Mesh, attachments and fibres of each muscle, computed once; nobody may change them in
+    place.
+    """
     scene = Scene("phantom_hip", units="mm")
     for name, mesh in bone_meshes().items():
         scene.add_bone(name, mesh)
@@ -356,7 +358,7 @@ def _parts(spacing):
         centre, wide, thin = tube.sections(along)
         fibres = [centre + across * wide + thick * thin for across, thick in FIBRE_PLACES]
         muscles[name] = ((vertices, faces), attach, fibres)
-    return bone_meshes(), muscles
+    return muscles
 
 
 def phantom_scene(
@@ -387,12 +389,11 @@ def phantom_scene(
     >>> len(scene.motion), scene.units
     (3, 'mm')
     """
-    bones, muscles = _parts(float(spacing))
     scene = Scene("phantom_hip", units="mm")
-    for name, mesh in bones.items():
+    for name, mesh in bone_meshes().items():
         scene.add_bone(name, mesh)
     scene.add_joint("hip", "pelvis", "femur", (0, 0, 0), AXES)
-    for name, (mesh, attach, fibres) in muscles.items():
+    for name, (mesh, attach, fibres) in _muscles(float(spacing)).items():
         scene.add_muscle(name, mesh, attach=attach, model=model, fibres=fibres)
     scene.set_motion(ramp={"hip.flexion": {"from": 0.0, "to": float(end), "step": float(step)}})
     return scene

@@ -214,14 +214,11 @@ def _read(path: str, array: str) -> tuple[Array, ...]:
 
 
 def _count_arrays(path):
-    """Number of arrays that a file declares, no more than needed to refuse it."""
+    """Number of arrays that a file declares."""
     if not os.path.getsize(path):
         return 0
-    count = 0
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        for found in _ARRAY.finditer(content):
-            count += int(found[1] or 1)
-    return count
+        return sum(int(found[1] or 1) for found in _ARRAY.finditer(content))
 
 
 def _values(data, array):
