@@ -347,15 +347,16 @@ class ViewerPage:
             if self._closed:
                 return
             start = time.perf_counter()
+            more = False
             try:
                 more = self._turn()
             except SolveError as error:
-                more = self._rest(f"Back to rest: {error}")
+                self._rest(f"Back to rest: {error}")
             except RBFMuscleError as error:
-                more = self._show_message(str(error))
+                self._show_message(str(error))
             except Exception as error:  # noqa: BLE001 - whatever it is, the page goes on
                 text = f"A bug: {type(error).__name__}: {error}; press Rest, and report it"
-                more = self._show_message(text)
+                self._show_message(text)
             self.server.flush()
             if more:
                 time.sleep(
@@ -392,8 +393,8 @@ class ViewerPage:
             self._draw(list(figures), look)
         return panel.play.value or any(figure.pending for figure in figures.values())
 
-    def _rest(self, message: str) -> bool:
-        """Set controls and models to rest; returns that no picture has to follow by itself."""
+    def _rest(self, message: str) -> None:
+        """Set controls and models to rest."""
         self._resting = False
         self._message = message
         self.panel.play.value = False
@@ -401,7 +402,6 @@ class ViewerPage:
         for side in self.sides:
             if side.figure is not None:
                 side.figure.rest()
-        return False
 
     def _draw(self, sides: list[ModelView], look: ViewSettings) -> None:
         with self.server.atomic():
@@ -412,12 +412,11 @@ class ViewerPage:
             self._write()
             self.panel.plot_on(sides)
 
-    def _show_message(self, text: str) -> bool:
-        """Show a text as one line; returns that no picture has to follow by itself."""
+    def _show_message(self, text: str) -> None:
+        """Show a text as one line, and stop the motion."""
         self._message = " ".join(text.split())[:LONGEST]
         self.panel.play.value = False
         self._write()
-        return False
 
     def _write(self) -> None:
         sides = [side for side in self.sides if side.figure is not None]

@@ -71,42 +71,41 @@ class MarkView:
         """Show the marks of some `KINDS`, but for hidden muscles, with bones in these poses."""
         for node in self._nodes.values():
             node.visible = False
+        middles = {}
         if "Joint axes" in shown:
-            for name, axes in self._marks.axes.items():
-                if axes.parent not in poses:
-                    continue
-                lines = to_world(axes.lines, poses[axes.parent])
-                place, points = f"{self._root}/axes/{name}", lines * self._factor
-                if place not in self._nodes:
-                    colours = np.broadcast_to(np.array(AXIS_COLOUR), lines.shape)
-                    self._nodes[place] = self._server.scene.add_line_segments(
-                        place, points, colours, thickness=3.0, thickness_units="screen"
-                    )
-                self._nodes[place].points = points
-                self._nodes[place].visible = True
-                self._add_name(name, lines[0].mean(axis=0))
+            for name, bone, points in self._marks.axes:
+                if bone in poses:
+                    lines = to_world(points, poses[bone])
+                    self._show(f"axes/{name}", lines)
+                    middles[name] = lines[0].mean(axis=0)
         if "Attachments" in shown:
-            for number, held in enumerate(self._marks.held):
-                if held.muscle in hidden:
-                    continue
-                points = to_world(held.points, poses[held.bone]) * self._factor
-                place = f"{self._root}/held/{number}"
-                if place not in self._nodes:
-                    self._nodes[place] = self._server.scene.add_point_cloud(
-                        place, points, HELD_COLOUR, point_size=POINT
-                    )
-                self._nodes[place].points = points
-                self._nodes[place].visible = True
+            for number, (muscle, bone, points) in enumerate(self._marks.held):
+                if muscle not in hidden:
+                    self._show(f"held/{number}", to_world(points, poses[bone]))
         if "Names" in shown:
             for name, (vertices, _) in surfaces.items():
                 if name not in hidden:
-                    self._add_name(name, vertices.mean(axis=0))
+                    middles[name] = vertices.mean(axis=0)
+        for name, middle in middles.items():
+            place = f"{self._root}/names/{name}"
+            if place not in self._nodes:
+                self._nodes[place] = self._server.scene.add_label(place, name)
+            self._nodes[place].position = middle * self._factor
+            self._nodes[place].visible = True
 
-    def _add_name(self, name: str, middle: Floats) -> None:
-        place = f"{self._root}/names/{name}"
-        if place not in self._nodes:
-            self._nodes[place] = self._server.scene.add_label(place, name)
-        self._nodes[place].position = middle * self._factor
+    def _show(self, name: str, points: Floats) -> None:
+        """Show lines (k, 2, 3), or points (n, 3)."""
+        place, points = f"{self._root}/{name}", points * self._factor
+        if place not in self._nodes and points.ndim == 3:
+            colours = np.broadcast_to(np.array(AXIS_COLOUR), points.shape)
+            self._nodes[place] = self._server.scene.add_line_segments(
+                place, points, colours, thickness=3.0, thickness_units="screen"
+            )
+        elif place not in self._nodes:
+            self._nodes[place] = self._server.scene.add_point_cloud(
+                place, points, HELD_COLOUR, point_size=POINT
+            )
+        self._nodes[place].points = points
         self._nodes[place].visible = True
 
 
@@ -228,7 +227,7 @@ class ModelView:
         self._bones = {
             name: clustered(v, f, BONE_TRIANGLES) for name, (v, f) in source.bones.items()
         }
-        self._volumes: dict[str, float] = {}
+        self._volumes = {name: mesh_volume(*mesh) for name, mesh in source.muscles.items()}
         self._nodes: dict[str, MeshHandle] = {}
         self._painted: list[GlbHandle] = []
         self._lines: dict[str, LineSegmentsHandle] = {}
@@ -243,13 +242,11 @@ class ModelView:
         """Show another model or run, or none; returns whether it is another."""
         if choice == self.choice:
             return False
-        figure = None if choice == "none" else self.source.figure(choice)
+        self.figure = None if choice == "none" else self.source.figure(choice)
         self.choice = self.caption.text = choice
-        self.figure = figure
-        self.picture = self.source.rest if figure is None else figure.advance()
+        self.picture = self.source.rest if self.figure is None else self.figure.advance()
         self.rest = self.picture
-        self._volumes = {name: mesh_volume(*mesh) for name, mesh in self.source.muscles.items()}
-        self.frame.visible = figure is not None
+        self.frame.visible = self.figure is not None
         return True
 
     def draw(self, look: ViewSettings, probes: list[BoneDistance], other: Picture | None) -> None:
@@ -268,14 +265,12 @@ class ModelView:
         painted, colouring = [], COLOURINGS[look.colour]
         for name, mesh in self.picture.surfaces.items():
             values = vertex_values(look.colour, name, self.picture, self.rest, probes, other)
-            if self.figure is not None:
-                self.numbers[name] = {
-                    "volume": 100.0
-                    * (mesh_volume(*self.picture.surfaces[name]) / self._volumes[name] - 1),
-                    "depth": self.picture.depth.get(name, math.nan),
-                    "moment": self.picture.moment_arms.get(name, math.nan),
-                    "mean": float(values.mean()),
-                }
+            self.numbers[name] = {
+                "volume": 100.0 * (mesh_volume(*mesh) / self._volumes[name] - 1),
+                "depth": self.picture.depth.get(name, math.nan),
+                "moment": self.picture.moment_arms.get(name, math.nan),
+                "mean": float(values.mean()),
+            }
             part, shown = self._part(mesh, look.cut), name not in look.hidden
             if look.colour == "fibres" and name in self.picture.fibres:
                 shown = False  # the surface would hide them
@@ -297,9 +292,7 @@ class ModelView:
     def _draw_fibres(self, look: ViewSettings) -> None:
         """Show fibres as lines where they are asked for, coloured by their stretch."""
         for name, fibres in self.picture.fibres.items():
-            shown = look.colour == "fibres" and name not in look.hidden
-            known = self._lines.get(name)
-            if shown:
+            if look.colour == "fibres" and name not in look.hidden:
                 points = fibres.points * (0.001 / self.source.millimetre)
                 colours = np.rint(255.0 * stretch_colours(fibres.local_stretch)).astype(np.uint8)
                 ends = [
@@ -310,8 +303,8 @@ class ModelView:
                 self._lines[name] = self.server.scene.add_line_segments(
                     place, *ends, thickness=LINE, thickness_units="screen"
                 )
-            elif known is not None:
-                known.visible = False
+            elif name in self._lines:
+                self._lines[name].visible = False
 
     def _part(self, mesh: Mesh, cut: tuple[int, float] | None) -> Mesh:
         """The part of a mesh that is shown, in metres."""
@@ -352,8 +345,8 @@ class ModelView:
 
     def points(self) -> list[Floats]:
         """Vertices (n, 3) of bones and muscles, where they are shown."""
-        poses = [
-            (vertices, self.picture.poses[name]) for name, (vertices, _) in self._bones.items()
+        bones = [
+            to_world(vertices, self.picture.poses[name])
+            for name, (vertices, _) in self._bones.items()
         ]
-        bones = [to_world(vertices, pose) for vertices, pose in poses]
         return bones + [vertices for vertices, _ in self.picture.surfaces.values()]

@@ -33,43 +33,35 @@ from rbfmuscle.validation import UsageError
 REACH = 25.0  # of a joint's axis to either side of its centre [mm]
 
 
-class Axes(NamedTuple):
-    """Lines (k, 2, 3) along the axes of a joint at rest, which move with its parent."""
+class Mark(NamedTuple):
+    """Points at rest that move with a bone, and the joint or muscle that they are of: ends
+    (k, 2, 3) of lines along the joint's axes, or vertices (n, 3) of the muscle.
+    """
 
-    parent: str
-    lines: Floats
-
-
-class Held(NamedTuple):
-    """Vertices (n, 3) of a muscle at rest that move with a bone."""
-
-    muscle: str
+    name: str
     bone: str
     points: Floats
 
 
 class Marks(NamedTuple):
-    """What can be marked: axes of joints by name, held vertices, and sentences on what is
-    doubtful.
-    """
+    """What can be marked: axes of joints, held vertices, and sentences on what is doubtful."""
 
-    axes: dict[str, Axes]
-    held: list[Held]
+    axes: list[Mark]
+    held: list[Mark]
     doubts: list[str]
 
 
 def scene_marks(scene: Scene) -> Marks:
     """The marks of a scene; attachments that tendons hold are left out."""
-    axes, reach = {}, from_mm(REACH, scene.units)
+    axes = []
     for joint in scene.joints:
         moving = [a for a in (*joint.rotations, *joint.translations) if a.coordinates]
-        along = np.array([axis.direction for axis in moving]).reshape(-1, 3)
-        along = reach * unit(along)
-        if len(along):
+        if moving:
+            along = from_mm(REACH, scene.units) * unit(np.array([a.direction for a in moving]))
             ends = np.stack([joint.centre - along, joint.centre + along], axis=1)
-            axes[joint.name] = Axes(joint.parent, ends)
+            axes.append(Mark(joint.name, joint.parent, ends))
     held = [
-        Held(muscle.name, end.bone, np.asarray(muscle.mesh.vertices)[end.vertices])
+        Mark(muscle.name, end.bone, np.asarray(muscle.mesh.vertices)[end.vertices])
         for muscle in scene.muscles
         for end in muscle.attachments
         if end.tendon is None
@@ -270,7 +262,7 @@ class SavedSource:
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
-        self.marks = Marks({}, [], [describe_doubts([doubt], 1) for doubt in first.info.doubts])
+        self.marks = Marks([], [], [describe_doubts([doubt], 1) for doubt in first.info.doubts])
         self.controls = {
             "frame": Control("Run", "frame", *(first.frames[k].index for k in (0, -1, 0)))
         }

@@ -178,10 +178,11 @@ def test_marks_of_a_scene_move_with_their_bones():
     scene = rm.phantom_scene()
     marks = scene_marks(scene)
     (joint,) = scene.joints
-    lines = marks.axes[joint.name].lines
+    ((name, _, lines),) = marks.axes
+    assert name == joint.name
     assert len(lines) == len(joint.coordinates)
     np.testing.assert_allclose(lines.mean(axis=1), np.tile(joint.centre, (len(lines), 1)))
-    assert sum(held.muscle == "extensor" for held in marks.held) == 2
+    assert sum(held.name == "extensor" for held in marks.held) == 2
     server, _ = open_server()
     try:
         view = MarkView(server, "/.marks", marks, 0.001)
