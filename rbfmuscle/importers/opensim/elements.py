@@ -9,10 +9,11 @@ import itertools
 import math
 import posixpath
 import re
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import cast
 from xml.etree import ElementTree
 
 import defusedxml.ElementTree
@@ -21,7 +22,6 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.scene.joints import (
-    Coordinate,
     Coupling,
     Curve,
     Function,
@@ -98,17 +98,8 @@ class ModelMuscle:
     title: str = ""
 
 
-class Walk(NamedTuple):
-    """How the bodies hang together.
-
-    ``steps`` are joints from the roots outwards, with whether each is walked from its child to its
-    parent; ``roots`` the bodies that no joint joins to those before them; ``left`` the joints
-    between two bodies that are joined already: each closes a loop.
-    """
-
-    steps: list[tuple[ModelJoint, bool]]
-    roots: list[str]
-    left: list[ModelJoint]
+# Joints from the roots outwards, with whether each is walked from its child to its parent.
+Steps = list[tuple[ModelJoint, bool]]
 
 
 @dataclass
@@ -134,18 +125,16 @@ class OsimModel:
     notes: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
 
-    def coordinates(self) -> dict[str, Coordinate]:
-        """Every coordinate by its full name, joint.coordinate."""
-        return all_coordinates(list(self.joints))
-
-    def walk(self, *, welds: bool = True) -> Walk:
-        """How the bodies hang together, by joints and, unless told otherwise, by weld constraints.
+    def walk(self, *, welds: bool = True) -> tuple[Steps, list[str], list[ModelJoint]]:
+        """How the bodies hang together, by joints and, unless told otherwise, by weld constraints:
+        steps; roots, the bodies that no joint joins to those before them; and the joints between
+        two bodies that are joined already, each of which closes a loop.
 
         A weld constraint comes after the joints, a joint that leaves its body free after both.
         """
         joints = [*self.joints, *(self.welds if welds else [])]
         waiting = sorted(joints, key=lambda joint: joint.kind == "free")
-        steps: list[tuple[ModelJoint, bool]] = []
+        steps: Steps = []
         roots: list[str] = []
         reached: set[str] = set()
         children = {joint.child for joint in joints}
@@ -160,13 +149,13 @@ class OsimModel:
                 waiting.remove(ready)
                 steps.append((ready, ready.child in reached))
                 reached |= {ready.parent, ready.child}
-        return Walk(steps, roots, waiting)
+        return steps, roots, waiting
 
     def resolved(self, values: Mapping[str, float] | None = None) -> dict[str, float]:
         """Every coordinate's value by its full name; bare names may be given where one joint has
         them.
         """
-        known = self.coordinates()
+        known = all_coordinates(list(self.joints))
         asked = {full_name(n, list(known), context="pose"): v for n, v in (values or {}).items()}
         return coordinate_values(asked, known, self.couplings)
 
@@ -176,7 +165,8 @@ class OsimModel:
         """The (4, 4) transform from every body to the ground [metre], at values of coordinates."""
         resolved = self.resolved(values)
         found = {body: np.eye(4) for body in self.bodies}
-        for joint, backward in self.walk(welds=welds).steps:
+        steps, _, _ = self.walk(welds=welds)
+        for joint, backward in steps:
             across = joint.across(resolved)
             if backward:
                 found[joint.parent] = found[joint.child] @ np.linalg.inv(across)
@@ -185,14 +175,14 @@ class OsimModel:
         return found
 
 
-def joints_between(walk: Walk, first: str, second: str) -> list[ModelJoint]:
+def joints_between(steps: Steps, first: str, second: str) -> list[ModelJoint]:
     """The joints on the way from a body to another; none where they have different roots."""
     above = {
         (joint.parent if backward else joint.child): (
             joint,
             joint.child if backward else joint.parent,
         )
-        for joint, backward in walk.steps
+        for joint, backward in steps
     }
     chains = []
     for name in (first, second):
@@ -357,20 +347,27 @@ HIGHEST_ORDER = 9
 BESIDE = ("coordinates", "axis", "scale")  # what stands beside a function in an element
 
 
-class Frames:
-    """Every frame of a model (the element ``<Model>``) by its absolute path.
+class Reading:
+    """A model that is being read from its element ``<Model>``, and what the file calls its parts.
 
-    ``bodies`` are plain names, unlike each other, by path; ``bare`` those of bodies by the name
-    that the file gives them.
+    ``bodies`` are plain names, unlike each other, by absolute path; ``bare`` those of bodies by the
+    name that the file gives them; ``offsets`` and ``stations`` are other frames, and points, by
+    absolute path; ``wraps`` are what paths go around by name, ``contacts`` contact geometry by
+    path; ``called`` are full names of coordinates by the file's.
     """
 
-    def __init__(self, model: Node) -> None:
-        self.bodies, self.bare = {"/ground": GROUND}, {GROUND: GROUND}
+    def __init__(self, model: OsimModel, element: Node) -> None:
+        self.model = model
+        self.bodies = {"/ground": GROUND}
+        self.bare = {GROUND: GROUND}
         self.offsets: dict[str, Node] = {}
         self.stations: dict[str, Node] = {}
+        self.wraps: dict[str, list[Node]] = defaultdict(list)
+        self.contacts: dict[str, Node] = {}
+        self.called: dict[str, str] = {}
         self._known: dict[str, tuple[str, np.ndarray]] = {}
         self._open: list[str] = []  # frames whose places are being sought
-        for node in model.iter():
+        for node in element.iter():
             if not isinstance(node, Node):
                 continue
             if node.tag == "Body" and node.name != GROUND:
@@ -383,14 +380,30 @@ class Frames:
                 self.offsets[node.path] = node
             elif node.tag == "Station":
                 self.stations[node.path] = node
+            elif node.tag.startswith("Contact"):
+                self.contacts[node.path] = node
+            for shape in node.objects("WrapObjectSet"):
+                self.wraps[shape.name].append(shape)
+        model.bodies = list(self.bodies.values())
+
+    def coordinate(self, name: str) -> str:
+        """Full name of a coordinate that the file names bare or by its path; empty where none has
+        it.
+        """
+        words = name.strip().split("/")
+        return self.called.get("/".join(words[-2:]), self.called.get(words[-1], ""))
 
     def place(self, name: str, *, inside: str = "/") -> tuple[str, np.ndarray]:
         """Body and frame in it (4, 4) of a name, absolute or relative to the component
         ``inside``.
         """
-        return self._placed(self._find(name, inside))
-
-    def _placed(self, path):
+        name = name.strip()
+        guesses = [posixpath.normpath(posixpath.join(inside, name))]
+        if "/" not in name:
+            guesses += [f"/bodyset/{name}", f"/{name}", f"/componentset/{name}"]
+        path = next((p for p in guesses if p in self.bodies or p in self.offsets), None)
+        if path is None:
+            raise SceneError(f"{inside}: there is no frame {name!r}; correct the socket")
         if path in self.bodies:
             return self.bodies[path], np.eye(4)
         if path in self._open or len(self._open) > _DEEPEST:
@@ -419,21 +432,11 @@ class Frames:
             found[key] = body, own[:3, :3] @ station.vector("location") + own[:3, 3]
         if len({body for body, _ in found.values()}) > 1:
             raise frame.error("its stations are in several bodies; put them into one")
-        turn = _station_axes(frame, *(found[key][1] for key in ("point_a", "point_b", "point_c")))
+        points = (found[key][1] for key in ("point_a", "point_b", "point_c"))
         transform = np.eye(4)
-        transform[:3, :3] = turn
+        transform[:3, :3] = _station_axes(frame, *points)
         body, transform[:3, 3] = found["origin_point"]
         return body, transform
-
-    def _find(self, name, inside):
-        name = name.strip()
-        guesses = [posixpath.normpath(posixpath.join(inside, name))]
-        if "/" not in name:
-            guesses += [f"/bodyset/{name}", f"/{name}", f"/componentset/{name}"]
-        for guess in guesses:
-            if guess in self.bodies or guess in self.offsets:
-                return guess
-        raise SceneError(f"{inside}: there is no frame {name!r}; correct the socket")
 
 
 def _station_axes(frame, a, b, c):

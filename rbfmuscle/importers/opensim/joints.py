@@ -1,15 +1,13 @@
 """Joints, coordinates and couplers of a model, as ``.osim`` files write them."""
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from rbfmuscle.importers.opensim.elements import (
-    Frames,
     ModelJoint,
     Node,
-    OsimModel,
+    Reading,
     frame_at,
     read_function,
 )
@@ -24,6 +22,7 @@ from rbfmuscle.scene.joints import (
     X,
     Y,
     Z,
+    all_coordinates,
     motion_of,
     scaled,
 )
@@ -38,22 +37,6 @@ CARRYING = {"ellipsoid": (X, Y, Z), "scapulothoracic": (X, Y, Z), "constantcurva
 QUARTER = frame_at((0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * math.pi))
 
 End = tuple[str, np.ndarray]
-
-
-@dataclass
-class Reading:
-    """A model that is being read, its frames, and every coordinate by what the file calls it."""
-
-    model: OsimModel
-    frames: Frames
-    called: dict[str, str] = field(default_factory=dict)
-
-    def coordinate(self, name: str) -> str:
-        """Full name of a coordinate that the file names bare or by its path; empty where none has
-        it.
-        """
-        words = name.strip().split("/")
-        return self.called.get("/".join(words[-2:]), self.called.get(words[-1], ""))
 
 
 def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
@@ -79,28 +62,31 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     for one in names:
         plain[one] = new_name(one, plain.values(), file=False)
     if kind == "custom":
-        axes = _custom_axes(node, names)
+        rotations, translations = _custom_axes(node, plain)
     else:
         turns, shifts = KINDS[kind] if kind in KINDS else (CARRYING[kind], ())
-        own = [TransformAxis(axis, (one,)) for axis, one in zip((*turns, *shifts), names)]
-        axes = {"rotation": tuple(own[: len(turns)]), "translation": tuple(own[len(turns) :])}
-    joints = [ModelJoint(name, parent, child, np.zeros(3), {}, kind=kind)]
-    joints[0].parent_frame, joints[0].child_frame = first, second
-    joints[0].rotations, joints[0].translations = axes["rotation"], axes["translation"]
+        own = [TransformAxis(axis, (plain[one],)) for axis, one in zip((*turns, *shifts), names)]
+        rotations, translations = tuple(own[: len(turns)]), tuple(own[len(turns) :])
+    joint = ModelJoint(
+        name,
+        parent,
+        child,
+        np.zeros(3),
+        {},
+        rotations,
+        translations,
+        kind=kind,
+        parent_frame=first,
+        child_frame=second,
+    )
+    joints = [joint]
     if kind in CARRYING:
-        joints = _carrying(reading, node, joints[0], kind, names)
-    used = []
+        joints = _carrying(reading, node, joint, kind, list(plain.values()))
     for joint in joints:
-        used += _finish(reading, joint, found, plain)
-    for one in names:
-        if one not in used:
+        _add_coordinates(reading, node, joint, found, plain)
+    for one, own_name in plain.items():
+        if not any(own_name in joint.coordinates for joint in joints):
             model.notes.append(f"coordinate {one!r} moves nothing: it is left out")
-    for joint in joints:
-        for one, fact in plain.items():
-            if fact in joint.coordinates:
-                full = f"{joint.name}.{fact}"
-                reading.called[f"{node.name}/{one}"] = full
-                reading.called.setdefault(one, full)
     model.joints += joints
 
 
@@ -174,6 +160,20 @@ def _carrying(reading, node, joint, kind, names):
     return [joint, winging]
 
 
+def _add_coordinates(reading, node, joint, found, plain):
+    """Give a joint the coordinates of its axes, and note what the file calls them."""
+    groups = {"rotation": joint.rotations, "translation": joint.translations}
+    axes = [(sort, axis) for sort, group in groups.items() for axis in group]
+    for one, name in plain.items():
+        if not any(name in axis.coordinates for _, axis in axes):
+            continue
+        motion = motion_of(name, axes)
+        joint.coordinates[name] = _coordinate(found.get(one), motion, reading.model)
+        full = f"{joint.name}.{name}"
+        reading.called[f"{node.name}/{one}"] = full
+        reading.called.setdefault(one, full)
+
+
 def _radii(node, tag):
     x, y, z = node.numbers(tag, "nan", count=3)
     if min(x, y, z) <= 0.0:
@@ -181,31 +181,10 @@ def _radii(node, tag):
     return x, y, z
 
 
-def _finish(reading, joint, found, plain):
-    """Give a joint its coordinates, by scene names; the file's names of those that it uses."""
-    groups = {"rotation": joint.rotations, "translation": joint.translations}
-    axes = [(sort, axis) for sort, group in groups.items() for axis in group]
-    used = [name for name in plain if any(name in axis.coordinates for _, axis in axes)]
-    for name in used:
-        motion = motion_of(name, axes)
-        element = found.get(name)
-        joint.coordinates[plain[name]] = (
-            Coordinate(motion) if element is None else _coordinate(element, motion, reading.model)
-        )
-    joint.rotations, joint.translations = (
-        tuple(
-            TransformAxis(
-                axis.direction, tuple(plain[name] for name in axis.coordinates), axis.function
-            )
-            for axis in group
-        )
-        for group in groups.values()
-    )
-    return used
-
-
-def _custom_axes(node, names):
-    """The rotations and the translations of a custom joint, in order."""
+def _custom_axes(node, plain):
+    """The rotations and the translations of a custom joint, in order; ``plain`` are scene names of
+    its coordinates, by the file's.
+    """
     table = node.child("SpatialTransform")
     if table is None and node.child("TransformAxisSet") is not None:
         raise node.error("is written as OpenSim 1 did; open the model in OpenSim 4 and save it")
@@ -220,16 +199,18 @@ def _custom_axes(node, names):
         if not direction.any():
             raise axis.error("its direction is zero; give it one")
         for name in of:
-            if name not in names:
+            if name not in plain:
                 raise axis.error(f"follows {name!r}, which is no coordinate of this joint")
         check_count(function, len(of), axis)
         axes[axis.name] = TransformAxis(
-            tuple((direction / np.linalg.norm(direction)).tolist()), tuple(of), function
+            tuple((direction / np.linalg.norm(direction)).tolist()),
+            tuple(plain[name] for name in of),
+            function,
         )
-    slots = ("rotation", "translation")
-    return {
-        slot: tuple(axes[f"{slot}{k}"] for k in (1, 2, 3) if f"{slot}{k}" in axes) for slot in slots
-    }
+    return tuple(
+        tuple(axes[f"{slot}{k}"] for k in (1, 2, 3) if f"{slot}{k}" in axes)
+        for slot in ("rotation", "translation")
+    )
 
 
 def check_count(function: Function, count: int, node: Node) -> None:
@@ -246,6 +227,8 @@ def check_count(function: Function, count: int, node: Node) -> None:
 
 
 def _coordinate(node, motion, model):
+    if node is None:  # the file leaves it out
+        return Coordinate(motion)
     rest = node.number("default_value")
     limits = tuple(node.numbers("range", count=2)) if node.word("range") else None
     if limits is not None and limits[0] > limits[1]:
@@ -269,28 +252,36 @@ def read_constraints(reading: Reading, constraints: list[Node]) -> None:
             _read_coupler(reading, node)
             continue
         title = f"{node.tag} {node.name!r}" if node.name else node.tag
-        ends = _constraint_ends(reading.frames, node)
+        ends = _constraint_ends(reading, node)
         if len(ends) != 2 or ends[0][0] == ends[1][0]:
             model.doubts.append(f"{title} is not taken: bodies move by coordinates alone")
         elif node.tag == "WeldConstraint":
             taken = [joint.name for joint in (*model.joints, *model.welds)]
             name = new_name(node.name or node.tag.lower(), taken)
             (parent, first), (child, second) = ends
-            weld = ModelJoint(name, parent, child, np.zeros(3), {}, kind="weld")
-            weld.parent_frame, weld.child_frame = first, second
+            weld = ModelJoint(
+                name,
+                parent,
+                child,
+                np.zeros(3),
+                {},
+                kind="weld",
+                parent_frame=first,
+                child_frame=second,
+            )
             model.welds.append(weld)
         else:
             model.constraints.append((title, ends[0][0], ends[1][0]))
 
 
-def _constraint_ends(frames, node):
+def _constraint_ends(reading, node):
     """The bodies that a constraint names, each with a frame in it (4, 4)."""
     ends = []
     for inner in node.nodes():
         tag = inner.tag
         if tag.startswith("socket_") or tag in ("body_1", "body_2", "line_body", "follower_body"):
             try:
-                ends.append(frames.place(node.word(tag), inside=node.path))
+                ends.append(reading.place(node.word(tag), inside=node.path))
             except SceneError:
                 continue
     for body, number in zip(range(len(ends)), ("1", "2")):
@@ -317,7 +308,7 @@ def _read_coupler(reading, node):
             raise node.error(f"names coordinate {name!r}, which moves no joint; correct it")
     function = scaled(function, factor) if factor != 1.0 else function
     reading.model.couplings.append(Coupling(full[0], tuple(full[1:]), function))
-    if reading.model.coordinates()[full[0]].locked:
+    if all_coordinates(reading.model.joints)[full[0]].locked:
         reading.model.notes.append(
             f"coordinate {target!r} is locked and follows others: it follows"
         )

@@ -9,20 +9,20 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.importers.opensim.elements import (
     GROUND,
-    Frames,
     ModelJoint,
     ModelMesh,
     Node,
     OsimModel,
-    Walk,
+    Reading,
+    Steps,
     frame_at,
     joints_between,
     read_xml,
     socket,
 )
-from rbfmuscle.importers.opensim.joints import Reading, read_constraints, read_joint
+from rbfmuscle.importers.opensim.joints import read_constraints, read_joint
 from rbfmuscle.importers.opensim.muscles import read_muscles
-from rbfmuscle.scene.joints import ordered
+from rbfmuscle.scene.joints import all_coordinates, ordered
 from rbfmuscle.scene.objects import plain_name
 from rbfmuscle.validation import SceneError, listed
 
@@ -46,19 +46,19 @@ def assemble(model: OsimModel) -> OsimModel:
                 f"the coupler of {coupling.coordinate} to {of} is not taken: {error}"
             )
     _meet_welds(model)
-    walk = model.walk()
-    for joint in walk.left:
-        _name_loop(model, walk, joint)
+    steps, roots, left = model.walk()
+    for joint in left:
+        _name_loop(model, steps, joint)
     for weld in model.welds:
-        if weld not in walk.left:
+        if weld not in left:
             model.notes.append(
                 f"{weld.name} is taken as a fixed joint, {weld.parent} to {weld.child}"
             )
     for title, first, second in model.constraints:
-        names = _moving(joints_between(walk, first, second))
+        names = _moving(joints_between(steps, first, second))
         depends = f"; {', '.join(names)} may break it" if names else ""
         model.doubts.append(f"{title} ({first} to {second}) is not taken{depends}")
-    for body in walk.roots:
+    for body in roots:
         if body != GROUND:
             model.doubts.append(
                 f"body {body!r} is joined to the ground by no joint: it stands where its frame "
@@ -71,11 +71,11 @@ def _meet_welds(model):
     """Change the rest values of coordinates as little as the weld constraints need, as OpenSim does
     when it opens a model.
     """
-    walk = model.walk(welds=False)
-    rings = [joints_between(walk, weld.parent, weld.child) for weld in model.welds]
+    steps, _, _ = model.walk(welds=False)
+    rings = [joints_between(steps, weld.parent, weld.child) for weld in model.welds]
     welds = [weld for weld, ring in zip(model.welds, rings) if ring]
     followers = {coupling.coordinate for coupling in model.couplings}
-    known = model.coordinates()
+    known = all_coordinates(model.joints)
     wanted = {name for ring in rings for name in _moving(ring)}
     for coupling in reversed(model.couplings):
         wanted |= set(coupling.of) if coupling.coordinate in wanted else set()
@@ -138,9 +138,9 @@ def _moving(joints: list[ModelJoint]) -> list[str]:
     return [f"{joint.name}.{name}" for joint in joints for name in joint.coordinates]
 
 
-def _name_loop(model: OsimModel, walk: Walk, joint: ModelJoint) -> None:
+def _name_loop(model: OsimModel, steps: Steps, joint: ModelJoint) -> None:
     """Name a joint or a weld constraint that closes a loop, the loop, and what is open in it."""
-    ring = joints_between(walk, joint.parent, joint.child)
+    ring = joints_between(steps, joint.parent, joint.child)
     what = f"{joint.name} ({joint.parent} to {joint.child})"
     if joint.kind == "free":
         model.notes.append(f"{what} holds nothing: other joints hold both bodies; not taken")
@@ -192,11 +192,9 @@ def _read_model(root, path):
     for element in node.iter() if prototypes else ():
         element.prototype = prototypes.get(element.tag)
     notes = _name_joints(node)
-    frames = Frames(node)
-    model = OsimModel(plain_name(node.name or path.stem), version, path)
-    model.notes += notes
-    model.bodies = list(frames.bodies.values())
-    changed = [f"{old!r} as {new}" for old, new in frames.bare.items() if old != new]
+    model = OsimModel(plain_name(node.name or path.stem), version, path, notes=notes)
+    reading = Reading(model, node)
+    changed = [f"{old!r} as {new}" for old, new in reading.bare.items() if old != new]
     if changed:
         names = listed(changed, MOST_RENAMED)
         model.notes.append(f"names are written in plain letters: {names}")
@@ -208,7 +206,6 @@ def _read_model(root, path):
         model.notes.append(
             f"<length_units> says {units!r}; lengths are read as metres, as OpenSim reads them"
         )
-    reading = Reading(model, frames)
     own = node.objects("components")
     if version >= SOCKETS or node.child("JointSet") is not None:
         joints = [*node.objects("JointSet"), *own]
@@ -217,7 +214,7 @@ def _read_model(root, path):
         _read_nested(reading, [b for b in node.objects("BodySet") if b.tag == "Body"])
     constraints = [*node.objects("ConstraintSet"), *own]
     read_constraints(reading, [one for one in constraints if one.tag.endswith("Constraint")])
-    read_muscles(reading, node, [*node.objects("ForceSet"), *own])
+    read_muscles(reading, [*node.objects("ForceSet"), *own])
     return assemble(model)
 
 
@@ -244,21 +241,21 @@ def _name_joints(node):
 
 def _read_sockets(reading, node, joints):
     """Versions from 4 on: joints in a set, which name frames; geometry attached to frames."""
-    model, frames = reading.model, reading.frames
+    model = reading.model
     for joint in joints:
         ends = []
         for role in ("parent", "child"):
             name = socket(joint, f"{role}_frame")
             if not name:
                 raise joint.error(f"names no {role} frame; give it one")
-            ends.append(frames.place(name, inside=joint.path))
+            ends.append(reading.place(name, inside=joint.path))
         read_joint(reading, joint, ends, "coordinates")
     for attached in node.iter("attached_geometry"):
         owner = attached.owner
-        if owner.path not in (*frames.bodies, *frames.offsets):
+        if owner.path not in (*reading.bodies, *reading.offsets):
             model.notes.append(f"{owner.place}: geometry of a {owner.tag} is not taken")
             continue
-        body, transform = frames.place(owner.path)
+        body, transform = reading.place(owner.path)
         for shape in attached.nodes():
             if shape.tag != "Mesh":
                 model.notes.append(
@@ -274,11 +271,11 @@ def _read_sockets(reading, node, joints):
 
 def _read_nested(reading, bodies):
     """Versions before 4: each joint stands inside the body that is its child."""
-    model, frames = reading.model, reading.frames
+    model = reading.model
     for body in bodies:
-        own = frames.bare[body.name]
+        own = reading.bare[body.name]
         for joint in body.objects("Joint"):
-            parent = frames.place(joint.word("parent_body"), inside=joint.path)[0]
+            parent = reading.place(joint.word("parent_body"), inside=joint.path)[0]
             # Six digits: so OpenSim 4 rounds these when it reads an older file.
             ends = [
                 (name, frame_at(_six(joint, where), _six(joint, turn)))

@@ -64,8 +64,8 @@ def import_osim(
         else:
             scene.add_bone(body)
             scene.missing_bones += [body] if any(mesh.body == body for mesh in model.meshes) else []
-    walk = model.walk()
-    for joint, backward in walk.steps:
+    steps, _, _ = model.walk()
+    for joint, backward in steps:
         parent, child = (joint.child, joint.parent) if backward else (joint.parent, joint.child)
         placed = joint.moved(places[joint.parent] @ joint.parent_frame)
         scene.add_joint(replace(placed, parent=parent, child=child, backward=backward))
@@ -80,18 +80,18 @@ def import_osim(
     scene.superior, scene.anterior = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
     found = Imported(scene, model, places, notes)
     if muscles:
-        _add_muscles(found, walk)
+        _add_muscles(found, steps)
     return found
 
 
-def _add_muscles(found, walk):
+def _add_muscles(found, steps):
     """A tube for each muscle of the model. As round tubes about lines lie in each other, muscles do
     not meet.
     """
     scene = found.scene
     scene.neighbours = None
     bones = {bone.name: ExactDistance(bone.mesh.vertices, bone.mesh.faces) for bone in scene.bones}
-    attachment_frames = _attachment_frames(walk, found.model.bodies, bones)
+    attachment_frames = _attachment_frames(steps, found.model.bodies, bones)
     for muscle in found.model.muscles:
         try:
             tube = make_tube(muscle, found.places, bones, attachment_frames)
@@ -115,12 +115,12 @@ def _add_muscles(found, walk):
             scene.doubts.append(f"{muscle.title} is not taken: {error}")
 
 
-def _attachment_frames(walk, bodies, bones):
+def _attachment_frames(steps, bodies, bones):
     """For each body the one that holds its muscles: itself where it has a mesh, else one with a
     mesh that no coordinate moves against it; without one, itself.
     """
     groups = {body: body for body in bodies}
-    for joint, _ in walk.steps:
+    for joint, _ in steps:
         if not joint.coordinates:
             first, second = groups[joint.parent], groups[joint.child]
             groups = {body: first if one == second else one for body, one in groups.items()}

@@ -27,7 +27,7 @@ import rbfmuscle as rm
 from rbfmuscle.importers.opensim.read import read_osim
 from rbfmuscle.importers.opensim.scene import import_osim, write_imported
 from rbfmuscle.scene.check import check_scene
-from rbfmuscle.scene.joints import joint_poses, rotation_about
+from rbfmuscle.scene.joints import all_coordinates, joint_poses, rotation_about
 
 
 @pytest.fixture
@@ -137,7 +137,7 @@ class TestWeldConstraints:
         text = model("ab", self.joints(), constraints=[weld("/bodyset/a", "/bodyset/b")])
         found = read(text)
         # The nearest values that meet it: both turns are the mean of 0.4 and 0.3.
-        assert found.coordinates()["p.p_q"].rest == pytest.approx(0.35, abs=1e-10)
+        assert all_coordinates(found.joints)["p.p_q"].rest == pytest.approx(0.35, abs=1e-10)
         places = found.transforms()
         np.testing.assert_allclose(places["a"], places["b"], atol=1e-10)
         np.testing.assert_allclose(places["b"][:3, 3], [0.0, 1.0, 0.0], atol=1e-10)
@@ -150,7 +150,7 @@ class TestWeldConstraints:
         frames = offset("fa", "/bodyset/a", "0.1 -0.4 0.05", "0 0 0.2")
         frames += offset("fb", "/bodyset/b", "0 0.1 0")
         found = read(model("ab", self.joints(), constraints=[weld("fa", "fb", frames)]))
-        assert found.coordinates()["p.p_q"].rest == pytest.approx(0.306716193, abs=1e-9)
+        assert all_coordinates(found.joints)["p.p_q"].rest == pytest.approx(0.306716193, abs=1e-9)
         place = found.transforms()["b"]
         np.testing.assert_allclose(place[:3, 3], [0.264635775, 0.561426609, 0.05], atol=1e-9)
 
@@ -173,7 +173,7 @@ class TestWeldConstraints:
 
     def test_what_cannot_be_met_is_doubtful_and_changes_nothing(self, read):
         found = read(self.bars("0.2 -0.9 0"))
-        assert found.coordinates()["one.one_q"].rest == 0.3
+        assert all_coordinates(found.joints)["one.one_q"].rest == 0.3
         (doubt,) = found.doubts
         assert "wc (ground to c) cannot be met" in doubt
 
@@ -286,7 +286,7 @@ def test_an_axis_without_a_function_moves_nothing(read):
     functions = {"rotation1": ("q", ""), "rotation2": ("r", "<function/>")}
     own = coordinate("q", 0.5) + coordinate("r", -0.3)
     found = read(model("a", [axis_joint("c", "ground", "a", functions, own)]))
-    assert list(found.coordinates()) == ["c.r"]
+    assert list(all_coordinates(found.joints)) == ["c.r"]
     assert found.notes == ["coordinate 'q' moves nothing: it is left out"]
 
 
@@ -299,7 +299,7 @@ class TestNames:
         ]
         found = read(model("ab", joints, constraints=[]))
         np.testing.assert_allclose(found.transforms()["b"][:3, :3], turned(0.8), atol=1e-12)
-        assert list(found.coordinates()) == ["j.q", "k.q"]
+        assert list(all_coordinates(found.joints)) == ["j.q", "k.q"]
 
     def test_joints_without_names_or_coordinates_have_opensims(self, read):
         ends = ("/ground", "/bodyset/a"), ("/bodyset/a", "/bodyset/b")
@@ -307,12 +307,12 @@ class TestNames:
         again = joint("PinJoint", "", ("/ground", "/bodyset/c"), at=("1 0 0", "0 0 0"))
         found = read(model("abc", [*joints, again]))
         names = ["pinjoint._coord_0", *(f"freejoint._coord_{k}" for k in range(6))]
-        assert list(found.coordinates()) == [*names, "pinjoint_0._coord_0"]
+        assert list(all_coordinates(found.joints)) == [*names, "pinjoint_0._coord_0"]
         np.testing.assert_allclose(found.transforms()["c"][:3, 3], [1.0, 0.0, 0.0])
 
     def test_coordinates_left_out_of_a_custom_joint_are_those_of_its_axes(self, read):
         found = read(model("a", [axis_joint("c", "ground", "a", FUNCTIONS)]))
-        assert list(found.coordinates()) == ["c.q", "c.r"]
+        assert list(all_coordinates(found.joints)) == ["c.q", "c.r"]
 
     def test_names_in_other_scripts_stay_apart(self, read, tmp_path):
         joints = [pin("髋", "ground", "股骨", 0.3), pin("膝", "股骨", "胫骨", 0.5, "0 1 0")]
