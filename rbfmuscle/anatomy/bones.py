@@ -231,29 +231,29 @@ def main_axes(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.n
     return middle, np.linalg.eigh((away * weights[:, None]).T @ away)[1]
 
 
-def long_axis(bone: Part, below: list[Part], above: list[Part]) -> np.ndarray:
-    """Direction (3,) up a long bone: from the bones ``below`` to those ``above``, else from its
-    broad end.
+def long_axis(bone: Part, bones: list[Part]) -> np.ndarray:
+    """Direction (3,) up a long bone: from those of the bones that are below it to those above,
+    else from its broad end.
     """
     points, _, areas = bone.faces
     middle, axes = main_axes(points, areas)
     up = axes[:, 2] if bone.cut is None else bone.cut.normal
-    rise = sum((b.points.mean(axis=0) - middle) @ up for b in above)
-    rise -= sum((b.points.mean(axis=0) - middle) @ up for b in below)
+    rise = sum((b.points.mean(axis=0) - middle) @ up for b in neighbours(bone, bones, _ABOVE))
+    rise -= sum((b.points.mean(axis=0) - middle) @ up for b in neighbours(bone, bones, _BELOW))
     if not rise:
         share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
         rise = areas[share < END].sum() - areas[share > 1.0 - END].sum()
     return up if rise >= 0.0 else -up
 
 
-def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
+def femur_frame(femur: Part, bones: list[Part]) -> Frame:
     """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it;
     head inwards.
     """
-    if femur.cut is not None and _is_below(femur, femur.cut, above, below):
+    if femur.cut is not None and _is_below(femur, femur.cut, bones):
         return _stump_frame(femur, femur.cut)
     points, _, areas = femur.faces
-    up = long_axis(femur, below, above) if femur.cut is None else femur.cut.normal
+    up = long_axis(femur, bones) if femur.cut is None else femur.cut.normal
     share = (points @ up - (points @ up).min()) / np.ptp(points @ up)
     shaft = (share > SHAFT[0]) & (share < SHAFT[1])
     end = share < FOOT
@@ -268,14 +268,17 @@ def femur_frame(femur: Part, below: list[Part], above: list[Part]) -> Frame:
     return frame
 
 
-def _is_below(femur: Part, cut: Cut, above: list[Part], below: list[Part]) -> bool:
+def _is_below(femur: Part, cut: Cut, bones: list[Part]) -> bool:
     """Whether a femur is cut off at its lower end: by the bones beside it, else as a stump is less
     broad there than a knee.
     """
-    near = [(np.sign((bone.points.mean(axis=0) - cut.middle) @ cut.normal), -1.0) for bone in above]
-    near += [(np.sign((bone.points.mean(axis=0) - cut.middle) @ cut.normal), 1.0) for bone in below]
+    near = [
+        sign * np.sign((bone.points.mean(axis=0) - cut.middle) @ cut.normal)
+        for table, sign in ((_ABOVE, -1.0), (_BELOW, 1.0))
+        for bone in neighbours(femur, bones, table)
+    ]
     if near:
-        return sum(side * sign for side, sign in near) > 0
+        return sum(near) > 0
     far = (femur.points - cut.middle) @ -cut.normal
     broad = across(femur.points[far > (1.0 - END) * far.max()] - cut.middle, cut.normal)
     return float(np.linalg.norm(broad.mean(axis=0))) > HEAD_ASIDE * float(
@@ -519,9 +522,7 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
         if bone.kind in ("femur", "tibia") and bone.cut is not None
     ]
     for bone in femora:
-        bone.frame = femur_frame(
-            bone, neighbours(bone, bones, _BELOW), neighbours(bone, bones, _ABOVE)
-        )
+        bone.frame = femur_frame(bone, bones)
         bone.side = bone.side or bone.frame.side
         if bone.side != bone.frame.side:
             words = {"l": "left", "r": "right"}
@@ -533,7 +534,7 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
     for bone in bones if not femora else ():  # of a shank its foot lies in front
         feet = [b.points.mean(axis=0) for b in neighbours(bone, bones, _BELOW) if b.kind == "foot"]
         if bone.kind == "tibia" and feet:
-            up = shank_up(bone, bones)
+            up = long_axis(bone, bones)
             ahead = unit(across(np.mean(feet, axis=0) - bone.points.mean(axis=0), up))
             frames.append(Frame(up, ahead))
     if not frames:
@@ -571,8 +572,3 @@ def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]])
     """The bones of the classes that a table lists for a bone, on its side."""
     kinds = table.get(bone.kind, ())
     return [b for b in bones if b.kind in kinds and b.may_be_beside(bone)]
-
-
-def shank_up(tibia: Part, bones: list[Part]) -> np.ndarray:
-    """Direction (3,) up a tibia."""
-    return long_axis(tibia, neighbours(tibia, bones, _BELOW), neighbours(tibia, bones, _ABOVE))

@@ -177,7 +177,15 @@ def _read_folder(path):
         if len(voxels) == 0:
             empty.append(name)
             continue
-        layer = _free_layer(layers, voxels, first.labels.shape[1:], path)
+        # The first layer in which nothing has these voxels, a new one where all do.
+        free = (k for k, one in enumerate(layers) if not one.ravel()[voxels].any())
+        layer = next(free, len(layers))
+        if layer == len(layers):
+            layers.append(np.zeros(first.labels.shape[1:], dtype=np.uint16))
+        if len(layers) * layers[0].nbytes > MOST_BYTES:
+            raise MeshError(
+                f"{path}: its masks overlap in {len(layers)} layers; crop or split them"
+            )
         layers[layer].ravel()[voxels] = number
         together.names[number + layer * LAYER] = name
     if empty:
@@ -186,37 +194,28 @@ def _read_folder(path):
     return together
 
 
-def _free_layer(layers, voxels, shape, path):
-    """Number of the first layer in which nothing has these voxels, a new one where all do."""
-    for number, layer in enumerate(layers):
-        if not layer.ravel()[voxels].any():
-            return number
-    layers.append(np.zeros(shape, dtype=np.uint16))
-    if len(layers) * layers[0].nbytes > MOST_BYTES:
-        raise MeshError(f"{path}: its masks overlap in {len(layers)} layers; crop or split them")
-    return len(layers) - 1
-
-
 def _read_file(path):
+    from nibabel.filebasedimages import ImageFileError
+    from nibabel.spatialimages import HeaderDataError
+    from nibabel.wrapstruct import WrapStructError
+    from nrrd.errors import NRRDError
+
     if not path.exists():
         raise UsageError(f"{path} does not exist; give a label volume or a folder")
-    kind, read = (
-        ("NRRD", _read_nrrd)
-        if path.name.lower().endswith((".nrrd", ".nhdr"))
-        else ("NIfTI", _read_nifti)
-    )
+    kind = "NRRD" if path.name.lower().endswith((".nrrd", ".nhdr")) else "NIfTI"
+    own_errors = ImageFileError, HeaderDataError, WrapStructError, NRRDError
     try:
-        volume, unit = read(path)
+        volume, unit = _read_nrrd(path) if kind == "NRRD" else _read_nifti(path)
     except MeshError:
         raise
-    except (*BROKEN_FILE, *_own_errors(kind)) as error:
+    except (*BROKEN_FILE, *own_errors) as error:
         why = " ".join(str(error).split())[:120] or type(error).__name__
         raise MeshError(f"{path}: no readable {kind} volume ({why}); export it again") from None
     if unit not in _TO_MM:
         raise MeshError(f"{path}: unknown unit of length {unit!r} in its header")
     volume.affine[:3] *= _TO_MM[unit]
     volume.labels = _check_labels(volume.labels, path, volume.notes)
-    volume.affine = _check_affine(volume.affine, path)
+    _check_affine(volume.affine, path)
     if not volume.directed:
         volume.notes.append(NO_DIRECTIONS)
     occur = set(volume.values().tolist())
@@ -224,19 +223,6 @@ def _read_file(path):
     if empty:
         volume.notes.append(f"{len(empty)} named labels have no voxel: {', '.join(empty)}")
     return volume
-
-
-def _own_errors(kind):
-    """What the library for a kind of file raises besides usual errors."""
-    if kind == "NRRD":
-        from nrrd.errors import NRRDError
-
-        return (NRRDError,)
-    from nibabel.filebasedimages import ImageFileError
-    from nibabel.spatialimages import HeaderDataError
-    from nibabel.wrapstruct import WrapStructError
-
-    return ImageFileError, HeaderDataError, WrapStructError
 
 
 def _read_nifti(path):
@@ -387,7 +373,6 @@ def _check_affine(affine, path):
         )
     if abs(np.linalg.det(affine[:3, :3])) < 0.1 * edges.prod():
         raise MeshError(f"{path}: its axes do not span space; write its directions again")
-    return affine
 
 
 def read_names(path: Path) -> dict[int, str]:
@@ -714,7 +699,7 @@ def guess_volume(
         source=volume.source,
         unusable=unusable,
     )
-    guess.parts.notes[:0] = notes
+    guess.notes[:0] = notes
     return guess
 
 

@@ -21,12 +21,10 @@ from rbfmuscle.geometry.arrays import unit
 from rbfmuscle.geometry.surfaces import geodesic, surface_graph
 from rbfmuscle.importers.guess.sites import (
     PELVIS,
-    Anatomy,
     Site,
     Skeleton,
-    anatomy_of,
+    sites_of,
     sites_on,
-    whole_bone,
 )
 
 
@@ -106,38 +104,25 @@ def _past_patella(patella, muscle, skeleton):
     follows = {j.child: j.parent for j in skeleton.joints if j.ligament is not None}
     shins = {j.parent: j.child for j in skeleton.joints if j.child.kind == "tibia"}
     tibia = shins.get(follows.get(patella))
-    tuberosity = tibia and skeleton.site("tibial_tuberosity", tibia, muscle.points)
+    tuberosity = tibia and skeleton.site("tibial_tuberosity", tibia, muscle)
     if tuberosity is None:
         return None
-    poles = [skeleton.site(name, patella, muscle.points).core[0] for name in POLES]
+    poles = [skeleton.site(name, patella, muscle).core[0] for name in POLES]
     via = tuple((patella, skeleton.out_of_bone(pole, patella)) for pole in poles)
     return TendonGuess(tibia, skeleton.out_of_bone(tuberosity.core[0], tibia), via)
 
 
-def via_places(known: Anatomy, muscle: Part, skeleton: Skeleton) -> tuple[BonePlace, ...]:
+def _via_places(muscle, skeleton):
     """(bone, place) that the tendon of an insertion passes, out of the bones."""
     found = []
-    for name in known.via:
-        bones = [b for b in skeleton.bones if sites_on((name,), b)]
-        bones = [b for b in bones if b.may_be_beside(muscle)]
-        sites = ((b, skeleton.site(name, b, muscle.points)) for b in bones)
-        bone, site = next(((b, s) for b, s in sites if s is not None), (None, None))
-        if bone is not None and site is not None:
-            found.append((bone, skeleton.out_of_bone(site.core[0], bone)))
+    for name in sites_of(muscle.facts.name, "via"):
+        bones = (b for b in skeleton.bones if sites_on([name], b) and b.may_be_beside(muscle))
+        for bone in bones:
+            site = skeleton.site(name, bone, muscle)
+            if site is not None:
+                found.append((bone, skeleton.out_of_bone(site.core[0], bone)))
+                break
     return tuple(found)
-
-
-def tendon_by_mesh(tendon: TendonMesh, bone: Part, skeleton: Skeleton) -> TendonGuess:
-    """A tendon along its mesh, through middles that are held by the nearest bones."""
-    via = []
-    for middle in tendon.middles:
-        away = {b: float(d.distances(middle[None])[0]) for b, d in skeleton.bones.items()}
-        nearest = min(away, key=away.__getitem__)
-        inside = away[nearest] < 0.0
-        via.append((nearest, skeleton.out_of_bone(middle, nearest) if inside else middle))
-    points = bone.faces[0]
-    to = points[np.argmin(((points - tendon.end) ** 2).sum(axis=1))]
-    return TendonGuess(bone, to, tuple(via), tendon.part)
 
 
 def unused_tendons(
@@ -152,28 +137,20 @@ def unused_tendons(
         if not mine:
             reasons[tendon.file] = "a tendon by its name, but no muscle here has that name"
             continue
-        seen = min((see_tendon(tendon, muscle) for muscle in mine), key=lambda one: one.gap)
-        away = min(float(bone.distances(seen.end[None])[0]) for bone in skeleton.bones.values())
-        gaps = f"{seen.gap / skeleton.millimetre:.0f} mm from its muscle"
+        seen = (see_tendon(tendon, muscle) for muscle in mine)
+        end, _, _, gap = min(seen, key=lambda one: one[-1])
+        away = min(float(bone.distances(end[None])[0]) for bone in skeleton.bones.values())
+        gaps = f"{gap / skeleton.millimetre:.0f} mm from its muscle"
         gaps += f" and ends {away / skeleton.millimetre:.0f} mm from a bone"
         reasons[tendon.file] = f"a tendon that begins {gaps}, at most {REACHES:g} mm are believed"
     return reasons
 
 
-class TendonMesh(NamedTuple):
-    """A tendon's mesh as one muscle sees it: its end (3,), its middles (k, 3) on the way there, the
-    vertices of the muscle where it begins, and the distance between the two [scene unit].
+def see_tendon(tendon: Part, muscle: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """How a tendon's mesh runs, from a muscle on: its end (3,), its middles (k, 3) on the way
+    there, the vertices of the muscle where it begins, and the distance between the two
+    [scene unit].
     """
-
-    part: Part
-    end: np.ndarray
-    middles: np.ndarray
-    begins: np.ndarray
-    gap: float
-
-
-def see_tendon(tendon: Part, muscle: Part) -> TendonMesh:
-    """How a tendon's mesh runs, from a muscle on."""
     points = tendon.points
     away_from_muscle = cKDTree(muscle.points).query(points)[0]
     near = np.flatnonzero(away_from_muscle <= away_from_muscle.min() + JOINS * tendon.size)
@@ -190,7 +167,7 @@ def see_tendon(tendon: Part, muscle: Part) -> TendonMesh:
     distance = cKDTree(points).query(muscle.points)[0]
     gap = float(distance.min())
     begins = np.flatnonzero(distance <= gap + JOINS * tendon.size)
-    return TendonMesh(tendon, line[-1], line[kept[1:-1]], begins, gap)
+    return line[-1], line[kept[1:-1]], begins, gap
 
 
 def _corners(line, most):
@@ -341,7 +318,6 @@ def _say_touched(guess, distances, bodies):
 def _named_places(guess, distances, ends, skeleton):
     """Places on the bones that anatomy names: origins at one end, insertions at the other."""
     muscle, groups = guess.muscle, []
-    known = anatomy_of(muscle.facts.name)
     for side in ("origin", "insertion"):
         chosen: dict[Part, Place] = {}
         for kinds, must in getattr(muscle.facts, side):
@@ -352,9 +328,9 @@ def _named_places(guess, distances, ends, skeleton):
                 stands_in = bone.kind != kinds[0] and not {bone.kind, kinds[0]} <= {*PELVIS}
                 if stands_in:
                     guess.doubt(STAND_IN, f"no {kinds[0]} is here, the {bone.name} stands for it")
-                names = sites_on(getattr(known, side), bone) if known else ()
-                sites = (skeleton.site(name, bone, muscle.points) for name in names)
-                via = via_places(known, muscle, skeleton) if names and side == "insertion" else ()
+                names = sites_on(sites_of(muscle.facts.name, side), bone)
+                sites = (skeleton.site(name, bone, muscle) for name in names)
+                via = _via_places(muscle, skeleton) if names and side == "insertion" else ()
                 chosen[bone] = Place(bone, 0, tuple(filter(None, sites)), via, stands_in)
         groups.append(chosen)
 
@@ -382,8 +358,7 @@ def _away(place, tip):
 def _best_of(kinds, muscle, distances):
     """The bone to hold at: of the first class that is there, on the muscle's side, the nearest."""
     for kind in kinds:
-        here = [bone for bone in distances if bone.kind == kind]
-        fitting = [bone for bone in here if bone.may_be_beside(muscle)]
+        fitting = [bone for bone in distances if bone.kind == kind and bone.may_be_beside(muscle)]
         if fitting:
             return min(fitting, key=lambda bone: distances[bone].min())
     return None
@@ -445,7 +420,10 @@ def _hold(place, distance, ends, muscle, skeleton):
         reason = f"the whole end, {gap:.3g} mm from the {bone.name}, as its own bone is missing"
         return AttachmentGuess(bone, chosen, gap, reason, NO_SITE)
     points = muscle.points
-    sites = place.sites or (whole_bone(bone, skeleton.articular[bone]),)
+    sites = place.sites
+    if not sites:
+        whole = skeleton.covering(bone)
+        sites = (Site(bone.name, whole, whole),)
     near = cKDTree(np.concatenate([site.points for site in sites])).query(points)[0] / millimetre
     # The nearest place of the bone belongs to a site whose points are hardly aside of it.
     coarse = np.sqrt(bone.mesh.area / len(bone.faces[0])) / millimetre
@@ -480,15 +458,24 @@ def _hold_by_tendon(place, ends, muscle, skeleton):
     for part in skeleton.tendons:
         if muscle.facts.name not in part.tendon_of or not part.may_be_beside(muscle):
             continue
-        tendon = see_tendon(part, muscle)
-        begins = tendon.begins[ends.along(place.end)[tendon.begins] <= UPPER]
-        away = float(skeleton.bones[place.bone].distances(tendon.end[None])[0])
-        if len(begins) < FEWEST or max(tendon.gap, away) > REACHES * skeleton.millimetre:
+        end, middles, begins, gap = see_tendon(part, muscle)
+        begins = begins[ends.along(place.end)[begins] <= UPPER]
+        away = float(skeleton.bones[place.bone].distances(end[None])[0])
+        if len(begins) < FEWEST or max(gap, away) > REACHES * skeleton.millimetre:
             continue
+        # The tendon runs along its mesh, through middles that are held by the nearest bones.
+        via = []
+        for middle in middles:
+            off = {b: float(d.distances(middle[None])[0]) for b, d in skeleton.bones.items()}
+            nearest = min(off, key=off.__getitem__)
+            inside = off[nearest] < 0.0
+            via.append((nearest, skeleton.out_of_bone(middle, nearest) if inside else middle))
+        points = place.bone.faces[0]
+        to = points[np.argmin(((points - end) ** 2).sum(axis=1))]
+        tendon = TendonGuess(place.bone, to, tuple(via), part)
         reason = f"where {Path(part.file).stem} begins, which ends on the {place.bone.name}"
-        gap = tendon.gap / skeleton.millimetre
-        guess = tendon_by_mesh(tendon, place.bone, skeleton)
-        return AttachmentGuess(place.bone, begins, gap, reason, BESIDE, guess)
+        gap /= skeleton.millimetre
+        return AttachmentGuess(place.bone, begins, gap, reason, BESIDE, tendon)
     return None
 
 

@@ -45,52 +45,59 @@ MOST_TRIANGLES = 400_000
 
 
 @dataclass
-class Parts:
-    """What is in a folder, and the unit of its lengths.
+class SceneGuess:
+    """What was guessed of the meshes of a folder: bones and muscles, the unit of their lengths,
+    joints, directions and attachments.
 
     ``unusable`` gives reasons by file, ``missing_bones`` names those that are no muscles;
     ``notes`` name what was left out, misspelt or made coarser, and the unit where it was guessed.
     """
 
+    folder: Path
     units: str = ""
     bones: list[Part] = field(default_factory=list)
-    muscles: list[Part] = field(default_factory=list)
-    tendons: list[Part] = field(default_factory=list)
+    joints: list[JointGuess] = field(default_factory=list)
+    orientation: Orientation | None = None
+    muscles: list[MuscleGuess] = field(default_factory=list)
     unusable: dict[str, str] = field(default_factory=dict)
     missing_bones: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    @property
-    def millimetre(self) -> float:
-        """Its length in scene units."""
-        return from_mm(1.0, self.units)
+    def doubts(self) -> list[str]:
+        """One line for each guess that wants a look, the least sure first."""
+        rows = [(0.3, f"bone {bone.name}: {bone.doubt}") for bone in self.bones if bone.doubt]
+        rows += [
+            (0.0, f"{file} cannot be used: {reason}") for file, reason in self.unusable.items()
+        ]
+        rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
+        rows += [
+            (joint.confidence, f"joint of {joint.child.name}: {joint.reason}")
+            for joint in self.joints
+        ]
+        for muscle in self.muscles:
+            reasons = "; ".join(filter(None, [muscle.wrong, *muscle.reasons]))
+            rows.append((muscle.confidence, f"muscle {muscle.muscle.name}: {reasons}"))
+        return [text for sure, text in sorted(rows, key=lambda row: row[0]) if sure < DOUBTFUL]
 
 
-def read_parts(
-    folder: Path,
-    units: str | None,
-    base: Path,
-    *,
-    source: str = "",
-    unusable: Mapping[str, str] | None = None,
-) -> Parts:
+def _read_parts(found, units, base, source):
     """Bones, muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and
-    ``tendons``; files relative to ``base``. Messages name the ``source`` of the meshes, the folder
-    by default, and what of it was ``unusable`` before, by name, and why.
+    ``tendons``; files relative to ``base``. Messages name the ``source`` of the meshes.
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
-    found = Parts(unusable=dict(unusable or {}))
-    unknown = []
+    bones = found.bones
+    parts: dict[str, list[Part]] = {"bone": bones, "muscle": [], "tendon": [], "": []}
+    muscles = parts["muscle"]
     names = set()
     other = []
-    for path, stem, mesh in _file_meshes(folder, found.notes):
+    for path, stem, mesh in _file_meshes(found.folder, found.notes):
         facts = name_facts(stem)
         if facts.tissue == "other":
             other.append(path.name)
             continue
         # A tendon by its name, else by the folder that it is in, else by its name.
-        by_name = facts.tissue == "tendon" or path.parent == folder
+        by_name = facts.tissue == "tendon" or path.parent == found.folder
         tissue = facts.tissue if by_name else FOLDERS[path.parent.name.lower()]
         try:
             part = _read_part(
@@ -102,34 +109,33 @@ def read_parts(
             continue
         if facts.spelling:
             found.notes.append(f"{path.name}: {facts.spelling}")
-        kinds = {"bone": found.bones, "muscle": found.muscles, "tendon": found.tendons}
-        kinds.get(tissue, unknown).append(part)
+        parts[tissue].append(part)
     if other:
         found.notes.append(f"left out, neither bone nor muscle: {', '.join(other)}")
     # The largest of the others are bones until there are two, the rest muscles if they can be.
-    for part in sorted(unknown, key=lambda part: -part.size):
-        is_bone = len(found.bones) < 2 or not _can_be_muscle(part)
+    for part in sorted(parts[""], key=lambda part: -part.size):
+        is_bone = len(bones) < 2 or not _can_be_muscle(part)
         part.doubt = f"{'a bone' if is_bone else 'a muscle'} by its size, as its name is not known"
-        (found.bones if is_bone else found.muscles).append(part)
-    if not found.bones or not found.muscles:
-        kind, rest = ("bone", "muscles") if not found.bones else ("muscle", "bones")
-        listed = [Path(part.file).name for part in found.bones or found.muscles]
+        (bones if is_bone else muscles).append(part)
+    if not bones or not muscles:
+        kind, rest = ("bone", "muscles") if not bones else ("muscle", "bones")
+        listed = [Path(part.file).name for part in bones or muscles]
         listed += [f"{file} ({why})" for file, why in found.unusable.items()]
         raise UsageError(
-            f"{source or folder} holds no {kind} (by names or sizes all are {rest}, or cannot be "
+            f"{source} holds no {kind} (by names or sizes all are {rest}, or cannot be "
             f"used: {', '.join(listed) or 'no files'}); name files ({' '.join(MESH_SUFFIXES)}) or "
             "labels after what they are, or sort files into folders bones and muscles"
         )
     found.units = units or _guess_units(found)
-    for bone in list(found.bones):  # a scene would refuse those of wrong sizes
-        if not SMALLEST_MM <= bone.size / found.millimetre <= LARGEST_MM:
+    for bone in list(bones):  # a scene would refuse those of wrong sizes
+        if not SMALLEST_MM <= bone.size / from_mm(1.0, found.units) <= LARGEST_MM:
             words = f"it is {bone.size:.4g} {found.units} across"
-            found.bones.remove(bone)
+            bones.remove(bone)
             found.missing_bones.append(bone.name)
             found.unusable[Path(bone.file).name] = words
-    if not found.bones:
+    if not bones:
         raise UsageError(f"{bone.file} cannot be a bone: {words}; correct the units")
-    return found
+    return muscles, parts["tendon"]
 
 
 def _can_be_muscle(part):
@@ -211,35 +217,6 @@ initial = "keep"   # muscles that start inside a bone stay there; or "error"
 """
 
 
-@dataclass
-class SceneGuess:
-    """What was guessed of the meshes of a folder; ``root`` is the bone that stands still."""
-
-    folder: Path
-    parts: Parts
-    root: Part
-    joints: list[JointGuess]
-    orientation: Orientation | None
-    muscles: list[MuscleGuess] = field(default_factory=list)
-
-    def doubts(self) -> list[str]:
-        """One line for each guess that wants a look, the least sure first."""
-        rows = [(0.3, f"bone {bone.name}: {bone.doubt}") for bone in self.parts.bones if bone.doubt]
-        rows += [
-            (0.0, f"{file} cannot be used: {reason}")
-            for file, reason in self.parts.unusable.items()
-        ]
-        rows += [(0.1, doubt) for doubt in (self.orientation.doubts if self.orientation else ())]
-        rows += [
-            (joint.confidence, f"joint of {joint.child.name}: {joint.reason}")
-            for joint in self.joints
-        ]
-        for muscle in self.muscles:
-            reasons = "; ".join(filter(None, [muscle.wrong, *muscle.reasons]))
-            rows.append((muscle.confidence, f"muscle {muscle.muscle.name}: {reasons}"))
-        return [text for sure, text in sorted(rows, key=lambda row: row[0]) if sure < DOUBTFUL]
-
-
 def guess_scene(
     folder: Path,
     units: str | None,
@@ -259,51 +236,47 @@ def guess_scene(
     ``unusable``, by name, and why. UsageError if the folder is missing, holds no bone or no muscle,
     or is of no known unit.
     """
-    parts = read_parts(folder, units, base, source=source, unusable=unusable)
-    bones, millimetre = parts.bones, parts.millimetre
-    orientation = find_orientation(bones, header)
-    root, joints = guess_joints(bones, millimetre, orientation)
-    guess = SceneGuess(folder, parts, root, joints, orientation)
+    guess = SceneGuess(folder, unusable=dict(unusable or {}))
+    muscles, tendons = _read_parts(guess, units, base, source or folder)
+    bones = guess.bones
+    millimetre = from_mm(1.0, guess.units)
+    guess.orientation = find_orientation(bones, header)
+    root, joints = guess_joints(bones, millimetre, guess.orientation)
+    guess.joints = joints
     bodies = {bone: bone for bone in bones}
     for joint in joints:  # parents come before their children
         if joint.kind == "weld":
             bodies[joint.child] = bodies[joint.parent]
-    skeleton = _skeleton(guess, bodies, millimetre)
-    guess.muscles = [guess_attachments(muscle, skeleton) for muscle in parts.muscles]
-    # Where the bones that names ask for are not here, what is there is taken.
-    if len(bones) > 1 and all(muscle.wrong for muscle in guess.muscles):
-        guess.muscles = [
-            guess_attachments(muscle, skeleton, named=False) for muscle in parts.muscles
-        ]
-    tendons = (hold.tendon for muscle in guess.muscles for hold in muscle.holds)
-    used = {tendon.mesh for tendon in tendons if tendon is not None and tendon.mesh is not None}
-    unused = unused_tendons(parts.tendons, parts.muscles, used, skeleton)
-    parts.unusable |= unused
-    parts.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
-    for muscle in guess.muscles:
-        _leave_caps(muscle, capped)
-    order = [root, *(joint.child for joint in joints)]
-    for muscle in guess.muscles:  # from the bone that stands still outwards
-        muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
-    return guess
-
-
-def _skeleton(guess, bodies, millimetre):
-    bones, joints = guess.parts.bones, guess.joints
-    moving = [j for j in joints if j.kind != "weld"]
     meetings = [
-        (j.parent.name, j.child.name, j.centre if j.kind == "ball" else None) for j in moving
+        (j.parent.name, j.child.name, j.centre if j.kind == "ball" else None)
+        for j in joints
+        if j.kind != "weld"
     ]
     surfaces = articular_points(meetings, {bone.name: bone.mesh for bone in bones}, millimetre)
-    return Skeleton(
+    skeleton = Skeleton(
         {bone: Bone(bone.name, bone.mesh) for bone in bones},
         bodies,
         joints,
         millimetre,
         bone_frames(bones, joints, guess.orientation, millimetre),
         {bone: surfaces[bone.name] for bone in bones},
-        guess.parts.tendons,
+        tendons,
     )
+    guess.muscles = [guess_attachments(muscle, skeleton) for muscle in muscles]
+    # Where the bones that names ask for are not here, what is there is taken.
+    if len(bones) > 1 and all(muscle.wrong for muscle in guess.muscles):
+        guess.muscles = [guess_attachments(muscle, skeleton, named=False) for muscle in muscles]
+    holding = (hold.tendon for muscle in guess.muscles for hold in muscle.holds)
+    used = {tendon.mesh for tendon in holding if tendon is not None and tendon.mesh is not None}
+    unused = unused_tendons(tendons, muscles, used, skeleton)
+    guess.unusable |= unused
+    guess.notes += [f"{file} is not used: {reason}" for file, reason in unused.items()]
+    for muscle in guess.muscles:
+        _leave_caps(muscle, capped)
+    order = [root, *(joint.child for joint in joints)]
+    for muscle in guess.muscles:  # from the bone that stands still outwards
+        muscle.holds.sort(key=lambda hold: order.index(hold.bone) if hold.bone in order else 0)
+    return guess
 
 
 def _leave_caps(muscle, capped):
@@ -348,8 +321,19 @@ def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
     def final(text):
         return text.replace(trial.name, path.name).replace(f"{stage.name}/", "")
 
+    scene = None
     try:
-        scene = _load_trial(guess, trial, final)
+        while scene is None:
+            trial.write_text(_scene_text(guess, stage.name), encoding="utf-8")
+            try:
+                scene = Scene.load(trial)
+            except (SceneError, MeshError) as error:
+                # The muscle that it is about is wrong; an error about none is raised.
+                about = next((m for m in guess.muscles if m.muscle.name == error.muscle), None)
+                if about is None or about.wrong:
+                    raise
+                about.wrong, about.confidence = final(str(error)), 0.0
+                _check_runs(guess, path)
     finally:
         trial.unlink(missing_ok=True)
     (stage / path.name).write_text(final(_scene_text(guess)), encoding="utf-8")
@@ -357,24 +341,10 @@ def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
     return scene
 
 
-def _load_trial(guess, trial, final):
-    """The scene of a trial file, which names staged files, without what cannot be loaded."""
-    while True:
-        trial.write_text(_scene_text(guess, trial.stem), encoding="utf-8")
-        try:
-            return Scene.load(trial)
-        except (SceneError, MeshError) as error:
-            # The muscle that it is about is wrong; an error about none is raised.
-            found = [muscle for muscle in guess.muscles if muscle.muscle.name == error.muscle]
-            if not found or found[0].wrong:
-                raise
-            found[0].wrong, found[0].confidence = final(str(error)), 0.0
-            _check_runs(guess, final(str(trial)))
-
-
 def _write_coarse(guess, stage):
     """Meshes that were made coarser, staged beside the scene."""
-    for folder, parts in (("bones", guess.parts.bones), ("muscles", guess.parts.muscles)):
+    muscles = [muscle.muscle for muscle in guess.muscles]
+    for folder, parts in (("bones", guess.bones), ("muscles", muscles)):
         for part in parts:
             if part.coarse:
                 file = stage / "coarse" / folder / f"{part.name}.ply"
@@ -387,7 +357,7 @@ def _write_coarse(guess, stage):
 def _check_runs(guess, path):
     if all(muscle.wrong for muscle in guess.muscles):
         reasons = [guess.muscles[0].wrong]
-        reasons += [f"{file} cannot be used: {why}" for file, why in guess.parts.unusable.items()]
+        reasons += [f"{file} cannot be used: {why}" for file, why in guess.unusable.items()]
         raise UsageError(f"{path}: no muscle can be held by two bones ({'; '.join(reasons)})")
 
 
@@ -398,7 +368,7 @@ def _scene_text(guess: SceneGuess, stage: str = "") -> str:
     """
     bones = [
         table_text(_headed("[[bone]]", bone), {"name": bone.name, "mesh": bone.file}, _doubt(bone))
-        for bone in guess.parts.bones
+        for bone in guess.bones
     ]
     movable = [joint for joint in guess.joints if joint.axes and not joint.follows]
     motion = [_motion(movable[0])] if movable else []
@@ -416,23 +386,23 @@ def _doubt(part):
 
 
 def _head(guess):
-    folder, parts = guess.folder, guess.parts
+    folder = guess.folder
     lines = [
         f"# Scene guessed from the meshes in {folder.name or folder}. "
         "Check everything with the key guess, and remove the key of what is right.",
         "# All keys: docs/scene_file.md. Then: rbfmuscle check --picture, rbfmuscle run.",
-        *(f"# NOT USED: {file}: {reason}" for file, reason in parts.unusable.items()),
+        *(f"# NOT USED: {file}: {reason}" for file, reason in guess.unusable.items()),
     ]
     name = plain_name(folder.resolve().name or "scene")
-    row = {"format": FORMAT, "name": name, "units": parts.units}
+    row = {"format": FORMAT, "name": name, "units": guess.units}
     comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
-    if parts.missing_bones:
-        row["missing_bones"] = parts.missing_bones
+    if guess.missing_bones:
+        row["missing_bones"] = guess.missing_bones
         comments["missing_bones"] = (
             "bones whose meshes cannot be used; every run counts them as beyond its limits"
         )
-    if parts.notes:
-        row["notes"] = parts.notes
+    if guess.notes:
+        row["notes"] = guess.notes
         comments["notes"] = "what was assumed, left out or joined; check repeats it"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)

@@ -29,7 +29,7 @@ from rbfmuscle.anatomy.bones import (
     fit_condyles,
     fit_dome,
     fit_sphere,
-    shank_up,
+    long_axis,
     sole_direction,
 )
 from rbfmuscle.geometry.arrays import across, unit
@@ -112,8 +112,8 @@ class JointGuess:
             "name": self.name,
             "parent": self.parent.name,
             "child": self.child.name,
+            "type": self.kind,
         }
-        row["type"] = self.kind
         if self.kind == "weld":
             return row
         row["centre"] = rounded(self.centre, 6)
@@ -256,20 +256,23 @@ def _fit(parent, child, millimetre, area):
         fit for pair in pairs if (fit := fit_hinge(find_face(*pair, millimetre, band))) is not None
     ]
     # What rolls has the smaller radius, not its socket.
-    hinges.sort(key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]))
-    hinge = next(iter(hinges), None)
+    hinge = min(
+        hinges,
+        key=lambda fit: (fit.misfit > HINGE_MISFIT * fit.radii[0], fit.radii[0]),
+        default=None,
+    )
     fits_hinge = hinge is not None and hinge.misfit < HINGE_MISFIT * hinge.radii[0]
     gap = faces[0].gap
     kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "weld")
     if kind == "ball":
         sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
-        share = 100 * min(ball.cover, 1.0)
         why = (
             f"sphere of radius {ball.radii[0] / millimetre:.4g} mm, misfit "
-            f"{ball.misfit / millimetre:.2g} mm, "
+            f"{ball.misfit / millimetre:.2g} mm, on {100 * min(ball.cover, 1.0):.0f} % of a "
+            "hemisphere"
         )
-        why += f"on {share:.0f} % of a hemisphere"
-        why += "" if allowed else f"; anatomy has {low:g} to {high:g} mm"
+        if not allowed:
+            why += f"; anatomy has {low:g} to {high:g} mm"
         axes = {f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))}
         return JointGuess(parent, child, "ball", ball.centre, axes, sure, why)
     if kind == "hinge" and hinge is not None:
@@ -280,11 +283,13 @@ def _fit(parent, child, millimetre, area):
         )
         return JointGuess(parent, child, "hinge", hinge.centre, {"angle": hinge.axis}, sure, why)
     middle = faces[1].points.mean(axis=0) if len(faces[1].points) else child.points.mean(axis=0)
-    why = f"they are {gap:.2g} mm apart, "
-    why += "bound all over" if gap < BOUND else "neither ball nor hinge fits"
-    return JointGuess(
-        parent, child, "weld", middle, {}, 0.8 if gap < BOUND else 0.6 if named else 0.4, why
-    )
+    sure = 0.6 if named else 0.4
+    what = "neither ball nor hinge fits"
+    if gap < BOUND:
+        sure = 0.8
+        what = "bound all over"
+    why = f"they are {gap:.2g} mm apart, {what}"
+    return JointGuess(parent, child, "weld", middle, {}, sure, why)
 
 
 def fit_ball(face: Face) -> Fit:
@@ -348,7 +353,7 @@ def make_anatomical(
     elif pair == ("tibia", "talus"):
         knee = next((j for j in joints if j.child is joint.parent and j.kind == "hinge"), None)
         start = right if knee is None else -knee.axis
-        fit = fit_dome(joint.child, joint.parent, shank_up(joint.parent, bones), start, millimetre)
+        fit = fit_dome(joint.child, joint.parent, long_axis(joint.parent, bones), start, millimetre)
         _take(joint, fit, "talar dome and tibial plafond", "ankle", right)
     elif joint.kind == "hinge":
         joint.axes = {"angle": joint.axis * (-1.0 if joint.axis @ right < 0.0 else 1.0)}
@@ -382,7 +387,7 @@ def set_rest(joints: list[JointGuess], bones: list[Part]) -> None:
     """
     for joint in joints:
         if joint.child.kind == "tibia" and "flexion" in joint.axes:
-            thigh, shank = joint.parent.frame.superior, shank_up(joint.child, bones)
+            thigh, shank = joint.parent.frame.superior, long_axis(joint.child, bones)
             for other in joints:  # from centre to centre where both ends have one
                 if other.child is joint.parent and other.kind == "ball":
                     thigh = other.centre - joint.centre
@@ -395,7 +400,7 @@ def set_rest(joints: list[JointGuess], bones: list[Part]) -> None:
                 for b in bones
                 if b.kind in ("foot", "calcaneus") and b.side == joint.child.side
             ]
-            up = shank_up(joint.parent, bones)
+            up = long_axis(joint.parent, bones)
             if feet:
                 sole = sole_direction(np.vstack(feet), joint.axis, up)
                 joint.rest = _angle_about(joint.axis, np.cross(up, joint.axis), sole)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rbfmuscle.anatomy.bones import Orientation, Part, fit_condyles, shank_up
+from rbfmuscle.anatomy.bones import Orientation, Part, fit_condyles, long_axis
 from rbfmuscle.geometry.arrays import across, unit
 from rbfmuscle.importers.guess.joints import JointGuess
 from rbfmuscle.scene.bone import Bone
@@ -43,10 +43,6 @@ class BoneFrame(NamedTuple):
     def place(self, at: np.ndarray) -> np.ndarray:
         """Places (..., 3) of shares (..., 3) of the size along the axes."""
         return self.origin + self.size * np.asarray(at) @ self.axes
-
-    def shares(self, points: np.ndarray) -> np.ndarray:
-        """The inverse of `place`."""
-        return (points - self.origin) @ self.axes.T / self.size
 
 
 def bone_frames(
@@ -117,7 +113,7 @@ def _add_shank(found, femur, bones, joints, sign):
         size = float(np.ptp(patella.points @ axes[2]))
         _add(found, [patella], BoneFrame(0.5 * (low + high), axes, size))
     ankle = next((j for j in joints if j.parent is tibia and "dorsiflexion" in j.axes), None)
-    up = shank_up(tibia, bones)
+    up = long_axis(tibia, bones)
     size = SHANK * float(np.ptp(tibia.points @ up))
     if ankle is not None and ankle.confidence > BELIEVED:
         up = knee.centre - ankle.centre
@@ -144,26 +140,6 @@ ASIDE = 0.005  # what is nearer to an articular surface than this, in sizes of t
 MOST = 20_000  # points of a bone among which sites are looked for
 
 
-class SiteFacts(NamedTuple):
-    """A row of ``[sites]``: see the file."""
-
-    bone: str
-    at: np.ndarray
-    radius: float
-    out: np.ndarray | None = None
-    reach: float = 0.0
-
-
-class Anatomy(NamedTuple):
-    """Names of the sites of a muscle's origin and insertion, and of the places that its tendon
-    passes.
-    """
-
-    origin: tuple[str, ...]
-    insertion: tuple[str, ...]
-    via: tuple[str, ...]
-
-
 class Site(NamedTuple):
     """Where a muscle attaches: ``core`` (k, 3) are its landmarks on the bone, ``points`` (n, 3)
     all of it.
@@ -179,66 +155,21 @@ class Site(NamedTuple):
 
 
 @cache
-def _tables() -> tuple[dict[str, SiteFacts], dict[str, Anatomy]]:
-    table = tomllib.loads((Path(__file__).parent / "sites.toml").read_text(encoding="utf-8"))
-    sites = {}
-    for name, row in table["sites"].items():
-        out = None if "out" not in row else unit(np.array(row["out"], dtype=float))
-        at = np.array(row["at"], dtype=float)
-        sites[name] = SiteFacts(row["bone"], at, row["radius"], out, row.get("reach", 0.0))
-    muscles = {
-        name: Anatomy(*(tuple(row.get(key, "").split()) for key in Anatomy._fields))
-        for name, row in table["muscles"].items()
-    }
-    return sites, muscles
+def _tables():
+    return tomllib.loads((Path(__file__).parent / "sites.toml").read_text(encoding="utf-8"))
 
 
-def anatomy_of(muscle: str) -> Anatomy | None:
-    """Sites of a muscle by its name in ``names.toml``, None where they are not known."""
-    return _tables()[1].get(muscle)
+def sites_of(muscle: str, role: str) -> list[str]:
+    """Names of the sites of a muscle's ``origin`` or ``insertion``, or of the places that its
+    tendon passes (``via``), by its name in ``names.toml``; none where they are not known.
+    """
+    return _tables()["muscles"].get(muscle, {}).get(role, "").split()
 
 
-def sites_on(names: tuple[str, ...], bone: Part) -> list[str]:
+def sites_on(names: list[str], bone: Part) -> list[str]:
     """Those of some sites that lie on bones of this one's class."""
     kind = "pelvis" if bone.kind in PELVIS else bone.kind
-    return [name for name in names if _tables()[0][name].bone == kind]
-
-
-def find_site(name: str, bone: Part, frame: BoneFrame, articular: np.ndarray) -> Site:
-    """A site on a bone; ``articular`` (n, 3) are the points of its articular surfaces."""
-    facts = _tables()[0][name]
-    points = _covering(bone, articular)
-    tree = cKDTree(points)
-    stops = []
-    for at in facts.at:
-        place = frame.place(at)
-        if facts.out is not None:
-            near = points[tree.query_ball_point(place, facts.reach * frame.size)]
-            if len(near):
-                place = near[np.argmax(near @ (facts.out @ frame.axes))]
-        stops.append(place)
-    line = np.concatenate(
-        [np.linspace(a, b, STEPS) for a, b in itertools.pairwise(stops)] or [np.array(stops)]
-    )
-    core = points[np.unique(tree.query(line)[1])]
-    near = cKDTree(line).query(points)[0] < facts.radius * frame.size
-    near[tree.query(line)[1]] = True
-    return Site(name, core, points[near])
-
-
-def whole_bone(bone: Part, articular: np.ndarray) -> Site:
-    """All of a bone but its articular surfaces, where no site is known."""
-    points = _covering(bone, articular)
-    return Site(bone.name, points, points)
-
-
-def _covering(bone: Part, articular: np.ndarray) -> np.ndarray:
-    """Vertices and middles of the triangles of a bone off its articular surfaces, thinned."""
-    points = np.concatenate([bone.points, bone.faces[0]])
-    points = points[:: -(-len(points) // MOST)]
-    if len(articular):
-        points = points[cKDTree(articular).query(points)[0] > ASIDE * bone.size]
-    return points
+    return [name for name in names if _tables()["sites"][name]["bone"] == kind]
 
 
 CLEAR = 1.5  # via points and insertions lie so far out of bones [mm]
@@ -258,16 +189,45 @@ class Skeleton(NamedTuple):
     articular: dict[Part, np.ndarray]
     tendons: list[Part]
 
-    def frame(self, bone: Part, points: np.ndarray) -> BoneFrame | None:
-        """The frame of a bone that is nearest to some points (n, 3), of several."""
-        here = points.mean(axis=0)
-        frames = self.frames.get(bone, [])
-        return min(frames, key=lambda f: np.linalg.norm(f.origin - here), default=None)
+    def covering(self, bone: Part) -> np.ndarray:
+        """Vertices and middles of the triangles (n, 3) of a bone off its articular surfaces,
+        thinned.
+        """
+        points = np.concatenate([bone.points, bone.faces[0]])
+        points = points[:: -(-len(points) // MOST)]
+        articular = self.articular[bone]
+        if len(articular):
+            points = points[cKDTree(articular).query(points)[0] > ASIDE * bone.size]
+        return points
 
-    def site(self, name: str, bone: Part, points: np.ndarray) -> Site | None:
-        """A site on a bone, for a muscle of these points (n, 3); None without landmarks."""
-        frame = self.frame(bone, points)
-        return frame and find_site(name, bone, frame, self.articular[bone])
+    def site(self, name: str, bone: Part, muscle: Part) -> Site | None:
+        """A site on a bone, in the one of its frames that is nearest to the muscle; None without
+        landmarks.
+        """
+        here = muscle.points.mean(axis=0)
+        frames = self.frames.get(bone, [])
+        frame = min(frames, key=lambda f: np.linalg.norm(f.origin - here), default=None)
+        if frame is None:
+            return None
+        row = _tables()["sites"][name]
+        points = self.covering(bone)
+        tree = cKDTree(points)
+        stops = []
+        for at in row["at"]:
+            place = frame.place(at)
+            if "out" in row:
+                near = points[tree.query_ball_point(place, row["reach"] * frame.size)]
+                if len(near):
+                    out = unit(np.array(row["out"], dtype=float))
+                    place = near[np.argmax(near @ (out @ frame.axes))]
+            stops.append(place)
+        line = np.concatenate(
+            [np.linspace(a, b, STEPS) for a, b in itertools.pairwise(stops)] or [np.array(stops)]
+        )
+        nearest = tree.query(line)[1]
+        of_site = cKDTree(line).query(points)[0] < row["radius"] * frame.size
+        of_site[nearest] = True
+        return Site(name, points[np.unique(nearest)], points[of_site])
 
     def out_of_bone(self, point: np.ndarray, bone: Part) -> np.ndarray:
         """A place (3,) of a bone's surface, moved out of it by `CLEAR`."""
