@@ -151,62 +151,60 @@ def pack_runs(runs: Mapping[str, Animation]) -> str:
     ``scene.js``.
     """
     first = next(iter(runs.values()))
-    packer = _Packer(runs)
+    drawn = [part for run in runs.values() for part in (*run.bones, *run.muscles)]
+    low = np.min([points.min(axis=0) for part in drawn for points in part.vertices], axis=0)
+    high = np.max([points.max(axis=0) for part in drawn for points in part.vertices], axis=0)
+    step = float((high - low).max()) / _STEPS or 1.0
+    stream: list[bytes] = []
     parts = [
-        packer.part(muscle, k) for k, run in enumerate(runs.values()) for muscle in run.muscles
+        _pack_part(muscle, k, low, step, stream)
+        for k, run in enumerate(runs.values())
+        for muscle in run.muscles
     ]
-    parts += [packer.part(bone, -1) for bone in first.bones]
+    parts += [_pack_part(bone, -1, low, step, stream) for bone in first.bones]
     facts = {
         "panels": list(runs),
         "captions": first.captions,
         "parts": parts,
-        "step": packer.step,
+        "step": step,
         "views": VIEWS,
         "body": first.body.tolist(),
         "direction": first.direction.tolist(),
-        "origin": packer.origin.tolist(),
+        "origin": low.tolist(),
         "rate": FRAMES_A_SECOND / 2.0,
-        "bytes": base64.b64encode(zlib.compress(b"".join(packer.parts), 4)).decode("ascii"),
+        "bytes": base64.b64encode(zlib.compress(b"".join(stream), 4)).decode("ascii"),
     }
     # No name may end the script that holds it.
     return json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c")
 
 
-class _Packer:
-    """Arrays on their way into one stream."""
+def _pack_part(
+    part: AnimatedMesh, panel: int, origin: Floats, step: float, stream: list[bytes]
+) -> dict[str, object]:
+    """Facts of a muscle or bone, whose points and triangles go to a stream, in pieces: frames that
+    follow each other and have the same triangles. Points are whole steps from an origin.
+    """
+    pieces: list[dict[str, int]] = []
+    for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
+        frames = list(group)
+        faces = part.faces[frames[0]]
+        points = np.array([part.vertices[k] for k in frames])
+        whole = np.rint((points - origin) / step).astype(np.int32)
+        for axis in (0, 0, 1):  # twice over the frames, then over the points
+            whole = np.diff(whole, axis=axis, prepend=0)
+        stream.append(_by_place(whole.astype("<i2")))
+        corners = np.diff(np.asarray(faces, dtype="<i4").ravel(), prepend=0)
+        stream.append(_by_place(corners.astype("<i4")))
+        pieces.append({"frames": len(frames), "points": whole.shape[1], "faces": len(faces)})
+    entry: dict[str, object] = {"name": part.name, "panel": panel, "pieces": pieces}
+    entry |= {"colour": part.colour, "group": part.group}
+    if part.poses is not None:
+        poses = part.poses[: None if part.moves else 1, :3].round(6)
+        entry["poses"] = poses.reshape(len(poses), 12).tolist()
+    return entry
 
-    def __init__(self, runs: Mapping[str, Animation]) -> None:
-        drawn = [part for run in runs.values() for part in (*run.bones, *run.muscles)]
-        low = np.min([points.min(axis=0) for part in drawn for points in part.vertices], axis=0)
-        high = np.max([points.max(axis=0) for part in drawn for points in part.vertices], axis=0)
-        self.origin, self.step = low, float((high - low).max()) / _STEPS or 1.0
-        self.parts: list[bytes] = []
 
-    def part(self, part: AnimatedMesh, panel: int) -> dict[str, object]:
-        """Take in a muscle or bone, in pieces: frames that follow each other and have the same
-        triangles.
-        """
-        pieces: list[dict[str, int]] = []
-        for _, group in groupby(range(len(part.faces)), key=lambda k: id(part.faces[k])):
-            frames = list(group)
-            pieces.append(self._piece([part.vertices[k] for k in frames], part.faces[frames[0]]))
-        entry: dict[str, object] = {"name": part.name, "panel": panel, "pieces": pieces}
-        entry |= {"colour": part.colour, "group": part.group}
-        if part.poses is not None:
-            poses = part.poses[: None if part.moves else 1, :3].round(6)
-            entry["poses"] = poses.reshape(len(poses), 12).tolist()
-        return entry
-
-    def _piece(self, frames: list[Floats], faces: Integers) -> dict[str, int]:
-        """Take in the points of some frames and their triangles; how many there are of each."""
-        whole = np.rint((np.asarray(frames) - self.origin) / self.step).astype(np.int32)
-        for axis, times in ((0, 2), (1, 1)):
-            for _ in range(times):
-                whole = np.diff(whole, axis=axis, prepend=0)
-        self._add(whole.astype("<i2"))
-        self._add(np.diff(np.asarray(faces, dtype="<i4").ravel(), prepend=0).astype("<i4"))
-        return {"frames": len(frames), "points": len(frames[0]), "faces": len(faces)}
-
-    def _add(self, values: Integers) -> None:
-        places = np.frombuffer(values.tobytes(), dtype=np.uint8).reshape(-1, values.itemsize)
-        self.parts.append(places.T.tobytes())
+def _by_place(values: Integers) -> bytes:
+    """The first bytes of all numbers, then the second ones: like bytes together pack better."""
+    places = np.frombuffer(values.tobytes(), dtype=np.uint8).reshape(-1, values.itemsize)
+    return places.T.tobytes()

@@ -180,24 +180,12 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
     """Number of a new node: a muscle has a morph target for each frame but the first, a bone a pose
     for each.
     """
-    base, faces, normals = part.own(0)
+    owned = [part.own(k) for k in range(len(part.vertices))]
+    frames = [{"POSITION": vertices, "NORMAL": normals} for vertices, _, normals in owned]
     colour = [*linear_rgb(rgb(part.colour)).tolist(), 1.0]
     look = {"baseColorFactor": colour, "metallicFactor": 0.0, "roughnessFactor": 0.6}
-    primitive: dict[str, object] = {
-        "attributes": {
-            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
-            "NORMAL": file.add(normals, "VEC3", target=_VERTICES),
-        },
-        "indices": file.add(faces.reshape(-1, 1), "SCALAR", target=_INDICES),
-        "material": file.append("materials", {"name": part.name, "pbrMetallicRoughness": look}),
-    }
-    targets = []
-    for k in range(1, len(part.vertices)):
-        vertices, _, turned = part.own(k)
-        position = file.add(vertices - base, "VEC3", target=_VERTICES, bounds=True)
-        normal = file.add(turned - normals, "VEC3", target=_VERTICES)
-        targets.append({"POSITION": position, "NORMAL": normal})
-    node = file.add_node(part.name, primitive, targets)
+    material = file.append("materials", {"name": part.name, "pbrMetallicRoughness": look})
+    node = file.add_node(part.name, frames, owned[0][1], material=material)
     if part.poses is not None:
         turns, shifts = _quaternions(part.poses[:, :3, :3]), part.poses[:, :3, 3]
         place = {"rotation": turns[0].tolist(), "translation": shifts[0].tolist()}
@@ -210,24 +198,11 @@ def _add_part(file: "_File", part: AnimatedMesh) -> int:
 
 def _add_fibres(file: "_File", name: str, fibres: list[FibreLines]) -> int:
     """Number of a new node of lines, coloured by the stretch of the first frame."""
-    first = fibres[0]
-    base = first.points.reshape(-1, 3)
-    numbers = np.arange(len(base)).reshape(first.points.shape[:2])
+    frames = [{"POSITION": lines.points.reshape(-1, 3)} for lines in fibres]
+    frames[0]["COLOR_0"] = linear_rgb(stretch_colours(fibres[0].local_stretch)).reshape(-1, 3)
+    numbers = np.arange(len(frames[0]["POSITION"])).reshape(fibres[0].points.shape[:2])
     segments = np.stack([numbers[:, :-1].ravel(), numbers[:, 1:].ravel()], axis=1)
-    colours = linear_rgb(stretch_colours(first.local_stretch)).reshape(-1, 3)
-    primitive: dict[str, object] = {
-        "mode": _LINES,
-        "attributes": {
-            "POSITION": file.add(base, "VEC3", target=_VERTICES, bounds=True),
-            "COLOR_0": file.add(colours, "VEC3", target=_VERTICES),
-        },
-        "indices": file.add(segments.reshape(-1, 1), "SCALAR", target=_INDICES),
-    }
-    targets = []
-    for lines in fibres[1:]:
-        moved = lines.points.reshape(-1, 3) - base
-        targets.append({"POSITION": file.add(moved, "VEC3", target=_VERTICES, bounds=True)})
-    return file.add_node(name, primitive, targets)
+    return file.add_node(name, frames, segments, mode=_LINES)
 
 
 def _quaternions(rotations):
@@ -284,14 +259,24 @@ class _File:
         return self.append("accessors", entry)
 
     def add_node(
-        self, name: str, primitive: dict[str, object], targets: Sequence[Mapping[str, int]]
+        self, name: str, frames: Sequence[Mapping[str, Floats]], corners: Integers, **look: int
     ) -> int:
-        """Number of a new node with one primitive, which takes the forms of its morph targets, one
-        for each frame but the first.
+        """Number of a new node with one primitive that has these corners, and the vertices' numbers
+        (n, 3) in the first frame; morph targets take it to those in the other frames.
         """
+        base = frames[0]
+        primitive: dict[str, object] = {
+            "attributes": {key: self._add_vertices(key, values) for key, values in base.items()},
+            "indices": self.add(corners.reshape(-1, 1), "SCALAR", target=_INDICES),
+            **look,
+        }
+        targets = [
+            {key: self._add_vertices(key, values - base[key]) for key, values in frame.items()}
+            for frame in frames[1:]
+        ]
         entry: dict[str, object] = {"name": name, "primitives": [primitive]}
         if targets:
-            primitive["targets"] = list(targets)
+            primitive["targets"] = targets
             entry["weights"] = [0.0] * len(targets)
             entry["extras"] = {"targetNames": list(self.names[1:])}
         node = self.append("nodes", {"name": name, "mesh": self.append("meshes", entry)})
@@ -299,6 +284,9 @@ class _File:
             weights = np.eye(len(targets) + 1)[:, 1:]
             self.animate(node, "weights", self.add(weights.reshape(-1, 1), "SCALAR"))
         return node
+
+    def _add_vertices(self, key: str, values: Floats) -> int:
+        return self.add(values, "VEC3", target=_VERTICES, bounds=key == "POSITION")
 
     def animate(self, node: int, path: str, values: int) -> None:
         """Let an accessor move a node's ``path`` over the times."""
