@@ -100,37 +100,35 @@ def _fill(mesh: "UsdGeom.Mesh", part: AnimatedMesh, codes: list[float]) -> None:
     """
     from pxr import Gf, UsdGeom, Vt
 
-    for k in range(len(part.vertices)):
-        vertices, faces, normals = part.own(k)
-        at = [codes[k]] if part.poses is None else []
-        if k == 0 or not part.keeps_vertices:
-            topology_at = [] if part.keeps_vertices else at
-            corners = np.ascontiguousarray(faces, dtype=np.int32).ravel()
-            counts = Vt.IntArray(len(faces), 3)
-            _set(mesh.CreateFaceVertexCountsAttr(), counts, topology_at, first=k == 0)
-            corners = Vt.IntArray.FromNumpy(corners)
-            _set(mesh.CreateFaceVertexIndicesAttr(), corners, topology_at, first=k == 0)
-        points = np.ascontiguousarray(vertices, dtype=np.float32)
-        extent = np.stack([points.min(axis=0), points.max(axis=0)])
-        _set(mesh.CreatePointsAttr(), Vt.Vec3fArray.FromNumpy(points), at, first=k == 0)
-        _set(mesh.CreateExtentAttr(), Vt.Vec3fArray.FromNumpy(extent), at, first=k == 0)
-        # Without normals a surface that is no subdivision surface is drawn facet by facet.
-        turned = Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(normals, dtype=np.float32))
-        _set(mesh.CreateNormalsAttr(), turned, at, first=k == 0)
+    def vectors(arrays: list[np.ndarray]) -> list[Vt.Vec3fArray]:
+        return [Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(a, dtype="f4")) for a in arrays]
+
+    owned = [part.own(k) for k in range(len(part.vertices))]
+    points = [np.asarray(vertices, dtype=np.float32) for vertices, _, _ in owned]
+    corners = [np.ascontiguousarray(faces, dtype=np.int32).ravel() for _, faces, _ in owned]
+    at = codes if part.poses is None else []
+    changing_at = [] if part.keeps_vertices else at
+    counts = [Vt.IntArray(len(faces), 3) for _, faces, _ in owned]
+    _sample(mesh.CreateFaceVertexCountsAttr(), counts, changing_at)
+    indices = [Vt.IntArray.FromNumpy(numbers) for numbers in corners]
+    _sample(mesh.CreateFaceVertexIndicesAttr(), indices, changing_at)
+    _sample(mesh.CreatePointsAttr(), vectors(points), at)
+    extents = [np.stack([places.min(axis=0), places.max(axis=0)]) for places in points]
+    _sample(mesh.CreateExtentAttr(), vectors(extents), at)
+    # Without normals a surface that is no subdivision surface is drawn facet by facet.
+    _sample(mesh.CreateNormalsAttr(), vectors([normals for _, _, normals in owned]), at)
     mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     if part.poses is not None:
-        place = mesh.AddTransformOp()
-        for k, (code, pose) in enumerate(zip(codes, part.poses)):
-            _set(place, Gf.Matrix4d(pose.T), [code] if part.moves else [], first=k == 0)
+        poses = [Gf.Matrix4d(pose.T) for pose in part.poses]
+        _sample(mesh.AddTransformOp(), poses, codes if part.moves else [])
 
 
-def _set(attribute: "Usd.Attribute", value: object, at: list[float], *, first: bool) -> None:
-    """Give an attribute a value at time codes; without any, or of the first frame, as its default
-    too.
-    """
-    if first or not at:
-        attribute.Set(value)
-    for code in at:
+def _sample(
+    attribute: "Usd.Attribute | UsdGeom.XformOp", values: Sequence[object], codes: list[float]
+) -> None:
+    """Give an attribute its values at time codes, and the first one as its default."""
+    attribute.Set(values[0])
+    for code, value in zip(codes, values):
         attribute.Set(value, code)
 
 

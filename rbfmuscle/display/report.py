@@ -194,10 +194,12 @@ def _facts(saved: RunData) -> list[str]:
 def _lights(saved: RunData) -> list[CheckRow]:
     """A row for each of `LIGHTS`, then one for whatever else is beyond a limit."""
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
-    limits, missing = _limits(saved), saved.info.not_measured
+    limits = Limits(saved.info.limits, saved.info.fail_on)
+    missing = saved.info.not_measured
     beyond = {quantity_of(row.quantity) for row in exceeded(saved.info.muscles, limits)}
     other = sorted((beyond | set(limits.fail_on)) - known)
-    rows = [_light(saved, *row) for row in (*LIGHTS.items(), *((name, (name,)) for name in other))]
+    named = LIGHTS | {name: (name,) for name in other}
+    rows = [_light(saved, limits, title, quantities) for title, quantities in named.items()]
     found = [row for row in (*rows, _overlap_light(saved)) if row]
     if missing:
         found.append(
@@ -208,13 +210,11 @@ def _lights(saved: RunData) -> list[CheckRow]:
     return found
 
 
-def _limits(saved: RunData) -> Limits:
-    return Limits(saved.info.limits, saved.info.fail_on)
-
-
-def _light(saved: RunData, title: str, quantities: Sequence[str]) -> CheckRow | None:
+def _light(
+    saved: RunData, limits: Limits, title: str, quantities: Sequence[str]
+) -> CheckRow | None:
     """The worst of some quantities against their limits, over muscles and frames."""
-    limits, found = _limits(saved), []
+    found = []
     for muscle, table in saved.info.muscles.items():
         for name in quantities:
             facts = table.get(name)
@@ -342,8 +342,9 @@ def _tracks(
 
 def _summary(saved: RunData) -> Table:
     """A row for each muscle, those beyond most limits first."""
-    muscles, limits = saved.info.muscles, _limits(saved)
-    values = limits.values
+    muscles = saved.info.muscles
+    values = saved.info.limits
+    limits = Limits(values, saved.info.fail_on)
     used = [
         q
         for q in QUANTITIES
