@@ -107,7 +107,7 @@ class Part:
     facts: MuscleFacts | None = None
     tendon_of: tuple[str, ...] = ()  # muscles of which it is a tendon by its name
     coarse: bool = False  # whether the mesh was made coarser than its file
-    frame: Any = None  # Frame, of a femur
+    frame: Any = None  # Orientation, of a femur
 
     @cached_property
     def cut(self) -> Cut | None:
@@ -180,14 +180,18 @@ SPACE = 6.0
 
 
 @dataclass
-class Frame:
-    """Directions of a body or of a long bone, unit (3,); the side, ``"l"`` or ``"r"``, that the
-    bone's shape is of.
+class Orientation:
+    """Directions of a body or of a long bone, unit (3,).
+
+    ``side`` is the one that the bone's shape is of, ``"l"`` or ``"r"``; ``source`` is what those of
+    a body were found from, ``doubts`` say what speaks against them.
     """
 
     superior: np.ndarray
     anterior: np.ndarray
     side: str = ""
+    source: str = "the shapes of the bones"
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def right(self) -> np.ndarray:
@@ -246,7 +250,7 @@ def long_axis(bone: Part, bones: list[Part]) -> np.ndarray:
     return up if rise >= 0.0 else -up
 
 
-def femur_frame(femur: Part, bones: list[Part]) -> Frame:
+def femur_frame(femur: Part, bones: list[Part]) -> Orientation:
     """Directions of a femur by its own shape: shaft; breadth of the condyles, which lie behind it;
     head inwards.
     """
@@ -262,7 +266,7 @@ def femur_frame(femur: Part, bones: list[Part]) -> Frame:
     up = axes[:, 2] * np.copysign(1.0, axes[:, 2] @ up)
     behind, axes = main_axes(across(points[end] - middle, up), areas[end])
     anterior = unit(np.cross(up, axes[:, 2]))
-    frame = Frame(up, anterior * -np.copysign(1.0, anterior @ behind))
+    frame = Orientation(up, anterior * -np.copysign(1.0, anterior @ behind))
     head = np.average(points[top], axis=0, weights=areas[top]) - middle
     frame.side = "r" if head @ frame.right < 0 else "l"
     return frame
@@ -286,7 +290,7 @@ def _is_below(femur: Part, cut: Cut, bones: list[Part]) -> bool:
     )
 
 
-def _stump_frame(femur: Part, cut: Cut) -> Frame:
+def _stump_frame(femur: Part, cut: Cut) -> Orientation:
     """Directions of a femur without its lower end: across its cut, and from there to its head.
 
     Scans end across the body, so a cut shows which way is up better than what is left of the shaft.
@@ -306,7 +310,7 @@ def _stump_frame(femur: Part, cut: Cut) -> Frame:
     broad = unit(across(axis, up))
     side = femur.side or ("l" if np.cross(up, broad) @ inward > 0.0 else "r")
     right = broad if side == "l" else -broad
-    return Frame(up, np.cross(up, right), side)
+    return Orientation(up, np.cross(up, right), side)
 
 
 def sole_direction(points: np.ndarray, right: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -332,17 +336,18 @@ def fit_sphere(points: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, flo
     return middle + x, float(np.sqrt(max(last + np.dot(x, x), 0.0)))
 
 
-def fit_condyles(femur: Part, frame: Frame, millimetre: float) -> Fit | None:
+def fit_condyles(femur: Part, millimetre: float) -> Fit | None:
     """The knee's axis; None where a condyle has too few triangles."""
-    points, right = femur.faces[0], frame.right
-    along = points @ frame.superior
+    points = femur.faces[0]
+    right = femur.frame.right
+    along = points @ femur.frame.superior
     length = np.ptp(along)
     if femur.cut is not None:  # by its breadth at the knee
         length = BREADTHS * np.ptp(points[along < along.min() + BREADTH_AT * length] @ right)
     near = along < along.min() + CONDYLES * length
     points, normals, areas = (values[near] for values in femur.faces)
     for _ in range(AXIS_ROUNDS):
-        anterior = unit(np.cross(frame.superior, right))
+        anterior = unit(np.cross(femur.frame.superior, right))
         angle = np.degrees(np.arctan2(-normals @ np.cross(right, anterior), -normals @ anterior))
         chosen = (
             (np.abs(normals @ right) < SIDEWAYS) & (angle > POSTERIOR[0]) & (angle < POSTERIOR[1])
@@ -478,8 +483,8 @@ def fit_coaxial(
     x = found.x
     parts = np.split(residual(x) * size, np.cumsum([len(root) for root in roots])[:-1])
     misfit = float(np.sqrt(sum(np.mean(part**2) for part in parts)))
-    wrong = "" if found.success else UNSETTLED
-    return Fit(line(x)[1], x[4:] * size, misfit, line(x)[0], wrong=wrong)
+    turned, at = line(x)
+    return Fit(at, x[4:] * size, misfit, turned, wrong="" if found.success else UNSETTLED)
 
 
 AGREE = 45.0  # directions of bones and header that differ by more than this [degree] are named
@@ -492,14 +497,6 @@ _BELOW = {
     "femur": ("tibia", "patella", "fibula", "talus", "calcaneus", "foot"),
     "tibia": ("talus", "calcaneus", "foot"),
 }
-
-
-@dataclass
-class Orientation(Frame):
-    """Anatomical directions of a scene, what they were found from, and what speaks against them."""
-
-    source: str = "the shapes of the bones"
-    doubts: list[str] = field(default_factory=list)
 
 
 # The axes of NIfTI: x to the right, y forwards, z up.
@@ -536,7 +533,7 @@ def find_orientation(bones: list[Part], header: Orientation | None = None) -> Or
         if bone.kind == "tibia" and feet:
             up = long_axis(bone, bones)
             ahead = unit(across(np.mean(feet, axis=0) - bone.points.mean(axis=0), up))
-            frames.append(Frame(up, ahead))
+            frames.append(Orientation(up, ahead))
     if not frames:
         return header
     superior = unit(np.sum([frame.superior for frame in frames], axis=0))
@@ -570,5 +567,4 @@ def orient_scene(scene: Scene) -> Scene:
 
 def neighbours(bone: Part, bones: list[Part], table: dict[str, tuple[str, ...]]) -> list[Part]:
     """The bones of the classes that a table lists for a bone, on its side."""
-    kinds = table.get(bone.kind, ())
-    return [b for b in bones if b.kind in kinds and b.may_be_beside(bone)]
+    return [b for b in bones if b.kind in table.get(bone.kind, ()) and b.may_be_beside(bone)]

@@ -156,10 +156,11 @@ def _read_folder(path):
         )
     first = _read_file(files[0])
     layers: list[Array] = []
-    together = LabelVolume(first.labels, first.affine, {}, str(path), first.notes, first.directed)
+    names = {}
+    notes = first.notes
     if len(files) < len(found):
         hidden = ", ".join(file.name for file in found if file not in files)
-        together.notes.append(f"hidden files are not read: {hidden}")
+        notes.append(f"hidden files are not read: {hidden}")
     empty = []
     for number, file in enumerate(files, start=1):
         mask = _read_file(file)
@@ -169,11 +170,11 @@ def _read_folder(path):
             raise MeshError(f"{file}: its grid differs from that of {files[0].name}; resample it")
         name = re.sub(r"(\.seg)?(\.nii(\.gz)?|\.n(rr|hd)[dr])$", "", file.name, flags=re.IGNORECASE)
         if len(mask.values()) > 1:
-            together.notes.append(
+            notes.append(
                 f"{file.name} has {len(mask.values())} labels and is taken for one mask of them all"
             )
         voxels = np.flatnonzero(mask.labels.max(axis=0))
-        together.notes += [note for note in mask.notes if note not in together.notes]
+        notes += [note for note in mask.notes if note not in notes]
         if len(voxels) == 0:
             empty.append(name)
             continue
@@ -187,11 +188,11 @@ def _read_folder(path):
                 f"{path}: its masks overlap in {len(layers)} layers; crop or split them"
             )
         layers[layer].ravel()[voxels] = number
-        together.names[number + layer * LAYER] = name
+        names[number + layer * LAYER] = name
     if empty:
-        together.notes.append(f"{len(empty)} of {len(files)} masks are empty: {', '.join(empty)}")
-    together.labels = np.stack(layers) if layers else np.zeros_like(first.labels)
-    return together
+        notes.append(f"{len(empty)} of {len(files)} masks are empty: {', '.join(empty)}")
+    labels = np.stack(layers) if layers else np.zeros_like(first.labels)
+    return LabelVolume(labels, first.affine, names, str(path), notes, first.directed)
 
 
 def _read_file(path):
@@ -497,17 +498,14 @@ def label_surface(volume: LabelVolume, label: int, *, pieces: bool = False) -> L
             f"its volume within {100 * VOLUME_ERROR:.0f} %; resample the volume"
         )
     vertices, faces, count = drawn
-    corner = np.array([part.start for part in box]) - MARGIN
-    places = vertices + corner
+    places = vertices + (np.array([part.start for part in box]) - MARGIN)
     capped = np.zeros(len(places), dtype=bool)
     for axis, end in cuts:
         capped |= np.abs(places[:, axis] - end) < ON_CAP
-    world = to_world(places, volume.affine)
-    mesh = trimesh.Trimesh(world, faces, process=False)
+    mesh = trimesh.Trimesh(to_world(places, volume.affine), faces, process=False)
     if mesh.volume < 0:
         mesh.invert()
-    volume_mm3 = count * float(np.prod(volume.spacing))
-    return LabelSurface(name, mesh, volume_mm3, notes, capped)
+    return LabelSurface(name, mesh, count * float(np.prod(volume.spacing)), notes, capped)
 
 
 def _draw(mask, others, notes, pieces):

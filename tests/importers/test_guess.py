@@ -295,7 +295,7 @@ def test_a_condyle_larger_than_anatomy_has_is_refused_and_named(leg, millimetre)
     for scale in (1.0, 2.5):
         bones, _ = _leg_bones(leg, np.diag([*3 * [scale * millimetre], 1.0]))
         find_orientation(bones)
-        fit = fit_condyles(bones[1], bones[1].frame, millimetre)
+        fit = fit_condyles(bones[1], millimetre)
         said = (
             f"radius {fit.radii[0] / millimetre:.3g} mm, anatomy has {CONDYLE[0]:g} to "
             f"{CONDYLE[1]:g}"
@@ -331,7 +331,7 @@ def test_small_leg_keeps_the_axis_of_its_knee(leg, scale):
     for size in (1.0, scale):
         bones, _ = _leg_bones(leg, np.diag([size, size, size, 1.0]))
         find_orientation(bones)
-        fit = fit_condyles(bones[1], bones[1].frame, 1.0)
+        fit = fit_condyles(bones[1], 1.0)
         assert fit.wrong == ""
         axes.append(fit.axis)
     assert axes[0] @ axes[1] > np.cos(np.radians(1.0))
@@ -343,7 +343,7 @@ def test_a_fit_that_does_not_settle_is_refused(leg, monkeypatch, cap, rounds):
     find_orientation(bones)
     monkeypatch.setattr(f"rbfmuscle.anatomy.bones.{cap}", rounds)
     if cap == "AXIS_ROUNDS":
-        fit = fit_condyles(bones[1], bones[1].frame, 1.0)
+        fit = fit_condyles(bones[1], 1.0)
     else:
         points, _, areas = bones[1].faces
         middle = points.mean(axis=0)

@@ -89,7 +89,7 @@ def tendon_to_site(
     the bone, past the places that anatomy names.
     """
     last = via[-1][1] if via else end
-    points = np.vstack([site.nearest(last) for site in sites] or [bone.points])
+    points = np.concatenate([site.core for site in sites] or [bone.points])
     to = points[np.argmin(((points - last) ** 2).sum(axis=1))]
     guess = TendonGuess(bone, skeleton.out_of_bone(to, bone), via)
     if bone.kind == "patella" and muscle.facts is not None and muscle.facts.name == ALONG_LIGAMENT:

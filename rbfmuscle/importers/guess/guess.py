@@ -313,8 +313,8 @@ def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
         for hold in muscle.holds:
             file = stage / attachment_file(muscle.muscle.name, hold.bone.name)
             file.parent.mkdir(parents=True, exist_ok=True)
-            in_file = np.isin(muscle.muscle.read.vertex_map, hold.vertices)
-            np.savetxt(file, np.flatnonzero(in_file), fmt="%d")
+            in_file = np.flatnonzero(np.isin(muscle.muscle.read.vertex_map, hold.vertices))
+            np.savetxt(file, in_file, fmt="%d")
     # Paths in a scene file are relative to its folder, so a trial stands beside the final one.
     trial = path.with_name(f"{stage.name}.toml")
 
@@ -468,8 +468,7 @@ def scene_from_meshes(folder: Path, *, units: Literal["mm", "cm", "m"] | None) -
     if units is not None and units not in MM_PER_UNIT:
         raise UsageError(f"units must be m, cm or mm, got {units!r}")
     with TemporaryDirectory() as base:
-        guess = guess_scene(folder, units, Path(base))
-        return scene_in_memory(guess, Path(base))
+        return scene_in_memory(guess_scene(folder, units, Path(base)), Path(base))
 
 
 def scene_in_memory(guess: SceneGuess, base: Path) -> Scene:

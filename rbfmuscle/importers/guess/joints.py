@@ -348,7 +348,7 @@ def make_anatomical(
         axes = (right, inward * np.cross(up, right), inward * up)
         joint.axes, joint.ranges = dict(zip(COORDINATES["hip"], axes)), COORDINATES["hip"]
     elif pair == ("femur", "tibia"):
-        fit = fit_condyles(joint.parent, joint.parent.frame, millimetre)
+        fit = fit_condyles(joint.parent, millimetre)
         _take(joint, fit, "posterior condyles", "knee", -right)
     elif pair == ("tibia", "talus"):
         knee = next((j for j in joints if j.child is joint.parent and j.kind == "hinge"), None)

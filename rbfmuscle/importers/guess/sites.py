@@ -91,7 +91,7 @@ def _thigh(femur, hip, sign, millimetre):
     """
     away = np.linalg.norm(femur.points - hip.centre, axis=1)
     radius = float(np.median(np.sort(away)[: max(len(away) // 50, 8)]))
-    fit = fit_condyles(femur, femur.frame, millimetre)
+    fit = fit_condyles(femur, millimetre)
     if fit is not None and not fit.wrong and away.max() > WHOLE * THIGH * radius:
         up = hip.centre - fit.centre
         return BoneFrame(hip.centre, _axes(unit(up), fit.axis, sign), float(np.linalg.norm(up)))
@@ -148,10 +148,6 @@ class Site(NamedTuple):
     name: str
     core: np.ndarray
     points: np.ndarray
-
-    def nearest(self, place: np.ndarray) -> np.ndarray:
-        """The landmark (3,) nearest to a place (3,)."""
-        return self.core[np.argmin(((self.core - place) ** 2).sum(axis=1))]
 
 
 @cache
