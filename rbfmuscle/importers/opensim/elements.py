@@ -175,7 +175,7 @@ class OsimModel:
         return found
 
 
-def joints_between(steps: Steps, first: str, second: str) -> list[ModelJoint]:
+def joints_between(steps: Steps, first: str, second: str) -> list[Joint]:
     """The joints on the way from a body to another; none where they have different roots."""
     above = {
         (joint.parent if backward else joint.child): (
@@ -194,7 +194,7 @@ def joints_between(steps: Steps, first: str, second: str) -> list[ModelJoint]:
     (one, root), (two, other) = chains
     if root != other:
         return []
-    return [j for j in one if j not in two] + [j for j in reversed(two) if j not in one]
+    return [*(j for j in one if j not in two), *(j for j in reversed(two) if j not in one)]
 
 
 # The largest published models have 3 MB and a depth of 14.

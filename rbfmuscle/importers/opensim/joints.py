@@ -33,7 +33,12 @@ from rbfmuscle.validation import SceneError
 # the same order.
 RENAMED = {"slider": "slide", "pin": "hinge", "gimbal": "ball"}
 # Joints that become custom ones: turns about these axes, which carry the child over a surface.
-CARRYING = {"ellipsoid": (X, Y, Z), "scapulothoracic": (X, Y, Z), "constantcurvature": (X, Z, Y)}
+CARRYING = {
+    "ellipsoid": ((X, Y, Z), ()),
+    "scapulothoracic": ((X, Y, Z), ()),
+    "constantcurvature": ((X, Z, Y), ()),
+}
+TAKEN = KINDS | CARRYING
 QUARTER = frame_at((0.0, 0.0, 0.0), (0.0, 0.0, 0.5 * math.pi))
 
 End = tuple[str, np.ndarray]
@@ -49,7 +54,7 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
         raise node.error(f"joins body {parent!r} to itself; correct its frames")
     kind = node.tag.removesuffix("Joint").lower()
     kind = RENAMED.get(kind, kind)
-    if kind not in KINDS and kind not in CARRYING:
+    if kind not in TAKEN:
         raise node.error(
             f"{parent} to {child}: its kind is not in the table of joints, so body {child!r} "
             "cannot be placed; replace it by a CustomJoint in OpenSim"
@@ -64,7 +69,7 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     if kind == "custom":
         rotations, translations = _custom_axes(node, plain)
     else:
-        turns, shifts = KINDS[kind] if kind in KINDS else (CARRYING[kind], ())
+        turns, shifts = TAKEN[kind]
         own = [TransformAxis(axis, (plain[one],)) for axis, one in zip((*turns, *shifts), names)]
         rotations, translations = tuple(own[: len(turns)]), tuple(own[len(turns) :])
     joint = ModelJoint(
@@ -104,13 +109,11 @@ def _coordinates(node, tag, kind):
     names = list(found)
     if kind == "custom":
         table = node.child("SpatialTransform")
-        named = (
-            [name for axis in table.nodes() for name in axis.word("coordinates").split()]
-            if (table is not None and not names)
-            else []
-        )
-        return found, list(dict.fromkeys([*names, *named]))
-    turns, shifts = KINDS[kind] if kind in KINDS else (CARRYING[kind], ())
+        if not names and table is not None:
+            named = [name for axis in table.nodes() for name in axis.word("coordinates").split()]
+            names = list(dict.fromkeys(named))
+        return found, names
+    turns, shifts = TAKEN[kind]
     needed = len(turns) + len(shifts) + (kind == "scapulothoracic")
     names += [f"_coord_{k}" for k in range(len(names), needed)]
     if len(names) != needed:

@@ -4,6 +4,7 @@ are; its files.
 
 import re
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -100,8 +101,9 @@ def _add_muscles(found, steps):
                 for held, via in ((tube.held, False), (tube.via, True))
                 for body, rows in held.items()
             ]
-            mesh = tube.vertices, tube.faces
-            scene.add_muscle(muscle.name, mesh, attach=attach, model=dict(TUBE_MODEL))
+            scene.add_muscle(
+                muscle.name, (tube.vertices, tube.faces), attach=attach, model=dict(TUBE_MODEL)
+            )
             if tube.crossed:
                 scene.doubts.append(
                     f"{muscle.title}: its path goes through {', '.join(tube.crossed)}, and so does "
@@ -136,16 +138,13 @@ def _find_mesh(name: str, folders: list[Path]) -> Path | None:
     plain = name.replace("\\", "/")
     if re.match(r"/|[A-Za-z]:", plain) and not Path(plain).is_file():
         plain = Path(plain).name
-    for folder in folders:
-        if (folder / plain).is_file():
-            return folder / plain
-    wanted = Path(plain).name.lower()
+    places = [folder / plain for folder in folders]
     endings = ("",) if Path(plain).suffix.lower() in MESH_SUFFIXES else MESH_SUFFIXES
-    for parent in ((folder / plain).parent for folder in folders):
-        for file in sorted(parent.iterdir()) if parent.is_dir() else ():
-            if file.name.lower() in {wanted + ending for ending in endings}:
-                return file
-    return None
+    wanted = {Path(plain).name.lower() + ending for ending in endings}
+    exact = (place for place in places if place.is_file())
+    beside = (sorted(place.parent.iterdir()) for place in places if place.parent.is_dir())
+    alike = (file for files in beside for file in files if file.name.lower() in wanted)
+    return next(chain(exact, alike), None)
 
 
 def _body_meshes(
@@ -209,8 +208,7 @@ def _placed(
         raise MeshError(f"it is not there (looked in {where}); give its folder as geometry")
     part = read_part(file.with_name(f"{file.name}#{ALL}"))
     vertices, faces = check_mesh(part.vertices, part.faces)
-    transform = place @ mesh.transform
-    vertices = to_world(vertices * mesh.scale, transform)
+    vertices = to_world(vertices * mesh.scale, place @ mesh.transform)
     size = box_size(vertices)
     if not NARROWEST <= size <= WIDEST:
         raise MeshError(f"it is {size:.3g} m across, which no bone is")
