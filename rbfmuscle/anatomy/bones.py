@@ -365,9 +365,13 @@ def fit_condyles(femur: Part, millimetre: float) -> Fit | None:
         if settled:
             break
     centres, radii, misfits = (np.array(values) for values in zip(*fits))
-    misfit = float(np.sqrt(np.mean(misfits**2)))
-    wrong = _refused("condyle", radii, CONDYLE, millimetre) if settled else UNSETTLED
-    return Fit(centres.mean(axis=0), radii, misfit, right, wrong=wrong)
+    return Fit(
+        centres.mean(axis=0),
+        radii,
+        misfit=float(np.sqrt(np.mean(misfits**2))),
+        axis=right,
+        wrong=_refused("condyle", radii, CONDYLE, millimetre) if settled else UNSETTLED,
+    )
 
 
 def _fit_condyle(points, normals, areas, millimetre):

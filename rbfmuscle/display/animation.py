@@ -13,7 +13,6 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.run import appearance as look
-from rbfmuscle.run.appearance import VIEWS
 from rbfmuscle.run.data import RunData, frame_caption
 from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT
@@ -121,20 +120,27 @@ def read_animation(run: RunData, names: list[str], frames: list[int], *, unit: s
         bones.append(AnimatedMesh(name, look.BONE_COLOUR, [vertices * factor], [faces], poses))
     given = run.info.scene.motion.times
     times = None if given is None else dict(zip(run.frame_numbers, given))
-    name = str(run.info.scene.name or (run.directory.name if run.directory else "run"))
     if times is not None and np.any(np.diff([times[k] for k in frames]) <= 0.0):
         times = None  # no animation: they stand still, or go backwards
-    at = np.array([k / FRAMES_A_SECOND if times is None else times[k] for k in frames], dtype=float)
-    captions = [frame_caption(run, frame) for frame in frames]
-    direction = look.motion_direction([run.frame(frame).poses for frame in frames], run.body)
+    at = [k / FRAMES_A_SECOND if times is None else times[k] for k in frames]
     fibres = {}
     for muscle_name in names:
         lines = [run.frame(frame).fibres.get(muscle_name) for frame in frames]
         known = [x._replace(points=factor * x.points) for x in lines if x is not None]
         if len(known) == len(frames):
             fibres[look.fibres_name(muscle_name)] = known
-    timed = times is not None
-    return Animation(name, unit, at, timed, captions, muscles, bones, run.body, direction, fibres)
+    return Animation(
+        name=str(run.info.scene.name or (run.directory.name if run.directory else "run")),
+        unit=unit,
+        times=np.array(at, dtype=float),
+        timed=times is not None,
+        captions=[frame_caption(run, frame) for frame in frames],
+        muscles=muscles,
+        bones=bones,
+        body=run.body,
+        direction=look.motion_direction([run.frame(frame).poses for frame in frames], run.body),
+        fibres=fibres,
+    )
 
 
 # Whole numbers of which the longest side of all that moves has so many: 0.03 mm of 900.
@@ -167,7 +173,7 @@ def pack_runs(runs: Mapping[str, Animation]) -> str:
         "captions": first.captions,
         "parts": parts,
         "step": step,
-        "views": VIEWS,
+        "views": look.VIEWS,
         "body": first.body.tolist(),
         "direction": first.direction.tolist(),
         "origin": low.tolist(),

@@ -17,7 +17,6 @@ from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.loops import loop
 from rbfmuscle.run import appearance as look
-from rbfmuscle.run.appearance import rgb, tendon_mesh
 from rbfmuscle.run.data import RunData, frame_caption, open_run
 from rbfmuscle.scene.objects import Muscle, body_axes
 from rbfmuscle.scene.scene import Scene, doubtful
@@ -113,7 +112,7 @@ def _shaded(solid: Solid, axes: Floats) -> Floats:
     half = lamp + axes[2]
     facing = np.clip(normals @ lamp, 0.0, 1.0)[:, None]
     gloss = np.clip(normals @ (half / np.linalg.norm(half)), 0.0, 1.0)[:, None] ** 24
-    return rgb(solid.colour) * (0.42 + 0.62 * facing) + 0.1 * gloss
+    return look.rgb(solid.colour) * (0.42 + 0.62 * facing) + 0.1 * gloss
 
 
 def labelled(
@@ -369,7 +368,7 @@ def _muscle_solids(muscle: Muscle, colours: dict[str, str]) -> list[Solid]:
         held = np.isin(faces, attachment.vertices).all(axis=1)
         solids.append(Solid(vertices, faces[held], colours[attachment.bone]))
         free &= ~held
-    tendons = tendon_mesh(muscle, {end.name: end.place(AT_REST)[0] for end in muscle.tendons})
+    tendons = look.tendon_mesh(muscle, {end.name: end.place(AT_REST)[0] for end in muscle.tendons})
     if tendons is not None:
         solids.append(Solid(*tendons, look.TENDON_COLOUR))
     return [Solid(vertices, faces[free], _MUSCLE, _OPACITY), *solids]

@@ -156,7 +156,6 @@ def _page(saved: RunData) -> ReportPage:
         details = describe_details(verdict, table, info.scene.missing_bones, MOST_DOUBTS)
     else:
         answer = f"the run ended early ({info.status}): {info.message or ''}"
-    terms = [(name, text) for name, (_, text) in QUANTITIES.items()]
     return ReportPage(
         info.scene.name,
         _facts(saved),
@@ -170,7 +169,11 @@ def _page(saved: RunData) -> ReportPage:
                 "Every quantity of every muscle", "worst over the frames", table=_summary(saved)
             ),
             Section("Events", "each with its frame in events.csv", text=_events(saved.events)),
-            Section("How to read this", text=_READING, terms=terms),
+            Section(
+                "How to read this",
+                text=_READING,
+                terms=[(name, text) for name, (_, text) in QUANTITIES.items()],
+            ),
         ],
         footer=", ".join(f"{name} {value}" for name, value in info.versions.items()),
     )
@@ -232,15 +235,18 @@ def _light(
         return None
     _, muscle, name, worst, facts, limit = max(found, key=lambda entry: entry[0])
     unit = facts["unit"]
-    place = f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
-    allowed = (
-        f"{'≥' if name in LOWER_BOUNDS else '≤'} {limit:.3g}{'' if unit == '1' else ' ' + unit}"
-    )
-    cells = [number_cell(worst, unit, limit_state(name, worst, limit))]
     note = LIMITS[name].title if name in LIMITS else name
     if note.replace(" ", "_") != name:
         note = f"{note} ({name})"  # its name in ``metrics.csv``
-    return CheckRow(title, cells, allowed, note + place if worst else note)
+    if worst:
+        note += f": {muscle.replace('_', ' ')}, frame {facts.get('worst_frame', '–')}"
+    sign = "≥" if name in LOWER_BOUNDS else "≤"
+    return CheckRow(
+        title,
+        [number_cell(worst, unit, limit_state(name, worst, limit))],
+        limit=f"{sign} {limit:.3g}{'' if unit == '1' else ' ' + unit}",
+        note=note,
+    )
 
 
 def _overlap_light(saved: RunData) -> CheckRow | None:
@@ -257,13 +263,11 @@ def _overlap_light(saved: RunData) -> CheckRow | None:
         return None
     muscle = max(moved, key=moved.__getitem__)
     most = from_mm(MOVED, saved.units)
-    state = GOOD if moved[muscle] <= most else NEAR
-    place = muscle.replace("_", " ")
     return CheckRow(
         "Overlaps no bone in the scan",
-        [number_cell(moved[muscle], saved.units, state)],
-        f"doubt > {most:.3g} {saved.units}",
-        f"rest error beside overlaps ({name}): {place}",
+        [number_cell(moved[muscle], saved.units, GOOD if moved[muscle] <= most else NEAR)],
+        limit=f"doubt > {most:.3g} {saved.units}",
+        note=f"rest error beside overlaps ({name}): {muscle.replace('_', ' ')}",
     )
 
 

@@ -293,9 +293,15 @@ def _read_nrrd(path):
     unit = str((said.get("space units") or [""])[0]).strip('"').lower()
     # Spaces of the body are in mm by convention.
     directed = "space" in said
-    notes = [] if unit or directed else [NO_UNIT]
-    names = _segment_names(said, layered is not None)
-    return LabelVolume(data, affine, names, str(path), notes, directed), unit or "mm"
+    volume = LabelVolume(
+        data,
+        affine,
+        names=_segment_names(said, layered is not None),
+        source=str(path),
+        notes=[] if unit or directed else [NO_UNIT],
+        directed=directed,
+    )
+    return volume, unit or "mm"
 
 
 def _layer_axis(header, count):

@@ -128,10 +128,13 @@ class Panel:
                 [vertices[:, axis] for vertices, _ in self.source.muscles.values()]
             )
             cut = axis, float(points.min() + self.place.value * np.ptp(points))
-        hidden = frozenset(name for name, eye in self.eyes.items() if not eye.value)
-        others = *(model.value for model in self.models), self.quantity.value
-        marks = frozenset(kind for kind, box in self.marks.items() if box.value)
-        return ViewSettings(self.colour.value, hidden, cut, others, marks)
+        return ViewSettings(
+            colour=self.colour.value,
+            hidden=frozenset(name for name, eye in self.eyes.items() if not eye.value),
+            cut=cut,
+            others=(*(model.value for model in self.models), self.quantity.value),
+            marks=frozenset(kind for kind, box in self.marks.items() if box.value),
+        )
 
     def move_to(self, values: dict[str, float]) -> None:
         """Set controls."""

@@ -145,10 +145,10 @@ class LiveSource:
             self.controls[name] = Control(group, f"{label} [{unit}]" if unit else label, *ends)
         for name in session.activation:
             self.controls[ACTIVATION + name] = Control("Activation", name, 0.0, 1.0, 0.0)
-        moved = [
-            {n: x for n, x in frame.items() if n in session.limits} for frame in scene.motion.frames
+        self.motion = [
+            {n: shown_value(scene, n, x) for n, x in frame.items() if n in session.limits}
+            for frame in scene.motion.frames
         ]
-        self.motion = [{n: shown_value(scene, n, x) for n, x in frame.items()} for frame in moved]
 
     @cached_property
     def fields(self) -> Mapping[str, BoneSDF]:
@@ -215,14 +215,18 @@ class LiveFigure:
         surfaces = {
             n: (s.vertices, s.faces) for n, s in frame.surfaces.items()
         } or frame.material_meshes
-        depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
         meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
-        tendons = {name: mesh for name, mesh in meshes.items() if mesh is not None}
-        known = {name: depth for name, depth in depths.items() if depth is not None}
-        places = frame.poses, frame.tendons
-        fibres = {name: bundle.at(*places) for name, bundle in self._bundles.items()}
-        arms = self._moment_arms(frame)
-        return Picture(frame.poses, surfaces, tendons, frame.activations, known, "", fibres, arms)
+        depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
+        return Picture(
+            poses=frame.poses,
+            surfaces=surfaces,
+            tendons={name: mesh for name, mesh in meshes.items() if mesh is not None},
+            activation=frame.activations,
+            depth={name: depth for name, depth in depths.items() if depth is not None},
+            text="",
+            fibres={n: b.at(frame.poses, frame.tendons) for n, b in self._bundles.items()},
+            moment_arms=self._moment_arms(frame),
+        )
 
     def _moment_arms(self, frame: Frame) -> dict[str, float]:
         """Moment arm of each muscle about the coordinate that moved alone to reach a frame [scene
@@ -292,18 +296,23 @@ class SavedFigure:
 
     def advance(self, *, coarse: bool = False) -> Picture:
         """Read the frame."""
-        saved = self.saved
-        frame = self.frame
         self.pending = False
-        surfaces = {name: saved.mesh(name, frame) for name in saved.muscles}
+        saved = self.saved
+        number = self.frame
+        frame = saved.frame(number)
         named = {name: tendon_name(name) for name in saved.muscles}
-        tendons = {n: saved.mesh(mesh, frame) for n, mesh in named.items() if mesh in saved.tendons}
-        activation, depth, arms = (
-            self._known(quantity) for quantity in ("activation", "penetration_max", "moment_arm")
+        return Picture(
+            poses=frame.poses,
+            surfaces={name: saved.mesh(name, number) for name in saved.muscles},
+            tendons={
+                n: saved.mesh(mesh, number) for n, mesh in named.items() if mesh in saved.tendons
+            },
+            activation=self._known("activation"),
+            depth=self._known("penetration_max"),
+            text=frame_caption(saved, number),
+            fibres=dict(frame.fibres),
+            moment_arms=self._known("moment_arm"),
         )
-        text, fibres = frame_caption(saved, frame), dict(saved.frame(frame).fibres)
-        poses = saved.frame(frame).poses
-        return Picture(poses, surfaces, tendons, activation, depth, text, fibres, arms)
 
     def _known(self, quantity: str) -> dict[str, float]:
         series = {name: self.saved.series(name, quantity) for name in self.saved.muscles}

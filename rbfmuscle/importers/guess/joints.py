@@ -265,7 +265,6 @@ def _fit(parent, child, millimetre, area):
     gap = faces[0].gap
     kind = named or ("ball" if fits_ball else "hinge" if fits_hinge and gap >= BOUND else "weld")
     if kind == "ball":
-        sure = 1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0]) if fits_ball else 0.1
         why = (
             f"sphere of radius {ball.radii[0] / millimetre:.4g} mm, misfit "
             f"{ball.misfit / millimetre:.2g} mm, on {100 * min(ball.cover, 1.0):.0f} % of a "
@@ -273,15 +272,28 @@ def _fit(parent, child, millimetre, area):
         )
         if not allowed:
             why += f"; anatomy has {low:g} to {high:g} mm"
-        axes = {f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))}
-        return JointGuess(parent, child, "ball", ball.centre, axes, sure, why)
-    if kind == "hinge" and hinge is not None:
-        sure = 0.6 * max(1.0 - 0.5 * hinge.misfit / (HINGE_MISFIT * hinge.radii[0]), 0.0)
-        why = (
-            f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the "
-            "dome where they face"
+        return JointGuess(
+            parent,
+            child,
+            "ball",
+            ball.centre,
+            axes={f"rotation_{word}": axis for word, axis in zip("xyz", np.eye(3))},
+            confidence=1.0 - 0.5 * ball.misfit / (BALL_MISFIT * ball.radii[0])
+            if fits_ball
+            else 0.1,
+            reason=why,
         )
-        return JointGuess(parent, child, "hinge", hinge.centre, {"angle": hinge.axis}, sure, why)
+    if kind == "hinge" and hinge is not None:
+        return JointGuess(
+            parent,
+            child,
+            "hinge",
+            hinge.centre,
+            axes={"angle": hinge.axis},
+            confidence=0.6 * max(1.0 - 0.5 * hinge.misfit / (HINGE_MISFIT * hinge.radii[0]), 0.0),
+            reason=f"cylinder of radius {hinge.radii[0]:.4g}, misfit {hinge.misfit:.2g}, about the "
+            "dome where they face",
+        )
     middle = faces[1].points.mean(axis=0) if len(faces[1].points) else child.points.mean(axis=0)
     sure = 0.6 if named else 0.4
     what = "neither ball nor hinge fits"
@@ -298,9 +310,12 @@ def fit_ball(face: Face) -> Fit:
         return Fit(np.zeros(3), np.zeros(1), np.inf)
     centre, radius = fit_sphere(face.points, face.areas)
     away = np.linalg.norm(face.points - centre, axis=1) - radius
-    misfit = float(np.sqrt(np.average(away**2, weights=face.areas)))
-    cover = float(face.areas.sum() / (2.0 * np.pi * radius**2))
-    return Fit(centre, np.array([radius]), misfit, cover=cover)
+    return Fit(
+        centre,
+        np.array([radius]),
+        misfit=float(np.sqrt(np.average(away**2, weights=face.areas))),
+        cover=float(face.areas.sum() / (2.0 * np.pi * radius**2)),
+    )
 
 
 def fit_hinge(face: Face) -> Fit | None:

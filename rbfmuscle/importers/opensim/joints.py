@@ -241,8 +241,13 @@ def _coordinate(node, motion, model):
             f"coordinate {node.name!r} is prescribed by a function of time: not taken, it stays "
             f"at {rest:g}"
         )
-    clamped = node.truth("clamped") and limits is not None
-    return Coordinate(motion, rest, limits, clamped, node.truth("locked"))
+    return Coordinate(
+        motion,
+        rest,
+        limits,
+        clamped=node.truth("clamped") and limits is not None,
+        locked=node.truth("locked"),
+    )
 
 
 def read_constraints(reading: Reading, constraints: list[Node]) -> None:

@@ -388,10 +388,13 @@ def _read_muscle(reading, force, path, title):
         )
     force_most = force.number("max_isometric_force", FORCE)
     volume = force_most * force.number("optimal_fiber_length", FIBRE) / SPECIFIC_TENSION
-    name = new_name(force.name or force.tag, [one.name for one in reading.model.muscles])
-    points = [point for point in points if point is not None]
-    wraps = [shape for shape in wraps if shape is not None]
-    return ModelMuscle(name, points, wraps, volume, title)
+    return ModelMuscle(
+        name=new_name(force.name or force.tag, [one.name for one in reading.model.muscles]),
+        points=[point for point in points if point is not None],
+        wraps=[shape for shape in wraps if shape is not None],
+        volume=volume,
+        title=title,
+    )
 
 
 def _wrapping(reading, name, title):
@@ -421,8 +424,13 @@ def _wrapping(reading, name, title):
     if not shape.truth("active", True) or min(radii) <= 0.0:
         return None
     own = frame_at(shape.vector("translation"), shape.vector("xyz_body_rotation").tolist())
-    quadrant = shape.word("quadrant", "all").lower().removeprefix("+").replace("all", "")
-    return WrapShape(body, frame @ own, np.array(radii), shape.tag, quadrant)
+    return WrapShape(
+        body=body,
+        frame=frame @ own,
+        radii=np.array(radii),
+        kind=shape.tag,
+        quadrant=shape.word("quadrant", "all").lower().removeprefix("+").replace("all", ""),
+    )
 
 
 def _obstacle(reading, element, title):
@@ -438,9 +446,13 @@ def _obstacle(reading, element, title):
     own = frame_at(shape.vector("location"), shape.vector("orientation").tolist())
     hint = element.vector("contact_hint")[: 2 if shape.tag == "ContactCylinder" else 3]
     k = int(np.argmax(np.abs(hint)))
-    quadrant = "" if hint[k] == 0.0 else f"{'-' if hint[k] < 0.0 else ''}{'xyz'[k]}"
-    kind = shape.tag.replace("Contact", "Wrap")
-    return WrapShape(body, frame @ own, np.array(radii), kind, quadrant)
+    return WrapShape(
+        body=body,
+        frame=frame @ own,
+        radii=np.array(radii),
+        kind=shape.tag.replace("Contact", "Wrap"),
+        quadrant="" if hint[k] == 0.0 else f"{'-' if hint[k] < 0.0 else ''}{'xyz'[k]}",
+    )
 
 
 def _note(reading, text):
