@@ -71,7 +71,6 @@ class _Table(NamedTuple):
 @cache
 def _table():
     table = tomllib.loads((Path(__file__).parent / "names.toml").read_text(encoding="utf-8"))
-    sides = {form: side for side, forms in table["sides"].items() for form in forms.split()}
     words = dict(entry.strip().split(": ") for entry in table["words"]["table"].split(";"))
     forms = {form: word for word, forms in words.items() for form in forms.split()}
     other = {word for words in table["other"].values() for word in words.split()}
@@ -89,10 +88,19 @@ def _table():
                 muscles[key(name)] = MuscleFacts(first, *map(_places, places))
     ends = {word for words in table["ends"].values() for word in words.split()}
     shared = {key(name): _listed(found) for name, found in table["shared"].items()}
-    groups = {name: _listed(found) for name, found in table["groups"].items()}
     known = {word for name in (*bones, *muscles, *shared) for word in name}
     known |= other | ends | {*forms, *words}
-    return _Table(sides, forms, other, bones, muscles, ends, shared, groups, known)
+    return _Table(
+        sides={form: side for side, forms in table["sides"].items() for form in forms.split()},
+        forms=forms,
+        other=other,
+        bones=bones,
+        muscles=muscles,
+        ends=ends,
+        shared=shared,
+        groups={name: _listed(found) for name, found in table["groups"].items()},
+        known=known,
+    )
 
 
 def _listed(text):
@@ -124,11 +132,15 @@ def name_facts(name: str) -> NameFacts:
     tissue = "muscle" if muscle or says_muscle else "bone" if bone or says_bone else ""
     kind = table.bones[bone] if bone is not None and tissue == "bone" else ""
     used = muscle or bone or ()
-    shown = ", ".join(
-        f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used
+    return NameFacts(
+        tissue,
+        kind,
+        muscle=table.muscles[muscle] if muscle else None,
+        side="" if kind in MIDLINE else side,
+        spelling=", ".join(
+            f"{wrong!r} read as {right!r}" for wrong, right in spelling.items() if right in used
+        ),
     )
-    side = "" if kind in MIDLINE else side
-    return NameFacts(tissue, kind, table.muscles[muscle] if muscle else None, side, shown)
 
 
 def _without_groups(words, table):

@@ -295,9 +295,13 @@ class _File:
 
     def content(self, scene: dict[str, object]) -> bytes:
         """The whole file."""
-        asset = {"version": "2.0", "generator": "rbfmuscle"}
-        tree: dict[str, object] = {"asset": asset, "scene": 0, "scenes": [scene], **self.lists}
-        tree["buffers"] = [{"byteLength": self.size}]
+        tree: dict[str, object] = {
+            "asset": {"version": "2.0", "generator": "rbfmuscle"},
+            "scene": 0,
+            "scenes": [scene],
+            **self.lists,
+            "buffers": [{"byteLength": self.size}],
+        }
         if self.channels:
             tree["animations"] = [
                 {"name": "motion", "samplers": self.samplers, "channels": self.channels}

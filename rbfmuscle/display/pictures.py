@@ -210,8 +210,7 @@ def render_run(
     if not 0.0 < seconds <= _LONGEST:
         raise UsageError(f"an animation of {seconds:g} seconds; give up to 3600")
     frame = run.frame(-1 if frame is None else frame).index
-    poses = [shown.poses for shown in run.frames]
-    motion = look.motion_direction(poses, run.body)
+    motion = look.motion_direction([shown.poses for shown in run.frames], run.body)
     directions: dict[str, Sequence[float] | Floats] = {**look.VIEWS, "motion": motion}
     for view in views or ():
         if view not in directions:
@@ -232,8 +231,9 @@ def _draw_views(
     run = next(iter(runs.values()))
     titles = [f"{title}: {view}" if title else view for title in runs for view in axes]
     some = {run.frames[k].index for k in (0, len(run) // 2, -1)}
-    names = [*run.muscles, *run.tendons]
-    seen = np.concatenate([run.mesh(name, k)[0][::3] for name in names for k in some])
+    seen = np.concatenate(
+        [run.mesh(name, k)[0][::3] for name in (*run.muscles, *run.tendons) for k in some]
+    )
     size = fitted_size(next(iter(axes.values())), seen, area)
     cameras, chips = [aim(view, seen, size) for view in axes.values()], run.colours
     if len(chips) > _MOST_CHIPS:

@@ -63,9 +63,13 @@ class Panel:
         with tabs.add_tab("Show"):
             self._add_choices(colour)
         with tabs.add_tab("Plot") as self._tab:
-            depth = f"depth in bones [{source.units}]"
-            arm = f"moment arm [{source.units}]"
-            quantities = ("none", "volume error [%]", depth, arm, "mean of the colour")
+            quantities = (
+                "none",
+                "volume error [%]",
+                f"depth in bones [{source.units}]",
+                f"moment arm [{source.units}]",
+                "mean of the colour",
+            )
             self.quantity = self._watch(self.gui.add_dropdown("Quantity", quantities))
             self._plot: GuiUplotHandle | None = None
             self._lines, self._history = [], []

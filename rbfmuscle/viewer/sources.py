@@ -130,8 +130,9 @@ class LiveSource:
             }
             for items in (scene.bones, scene.muscles)
         )
-        held = {m.name: [a.bone for a in m.attachments] for m in scene.muscles}
-        groups = muscle_groups(scene.joints, held)
+        groups = muscle_groups(
+            scene.joints, {m.name: [a.bone for a in m.attachments] for m in scene.muscles}
+        )
         self.colours = muscle_colours(list(self.muscles), groups)
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")

@@ -395,15 +395,16 @@ def _head(guess):
     ]
     name = plain_name(folder.resolve().name or "scene")
     row = {"format": FORMAT, "name": name, "units": guess.units}
-    comments = {"units": "of every length here; a mesh in another unit takes scale = ..."}
+    comments = {
+        "units": "of every length here; a mesh in another unit takes scale = ...",
+        "missing_bones": "bones whose meshes cannot be used; every run counts them as beyond its "
+        "limits",
+        "notes": "what was assumed, left out or joined; check repeats it",
+    }
     if guess.missing_bones:
         row["missing_bones"] = guess.missing_bones
-        comments["missing_bones"] = (
-            "bones whose meshes cannot be used; every run counts them as beyond its limits"
-        )
     if guess.notes:
         row["notes"] = guess.notes
-        comments["notes"] = "what was assumed, left out or joined; check repeats it"
     for word in ("superior", "anterior") if guess.orientation is not None else ():
         row[word] = rounded(getattr(guess.orientation, word), 5)
         comments[word] = f"by {guess.orientation.source}"
@@ -437,8 +438,9 @@ def _confidence(confidence, reason):
     return {"confidence": round(confidence, 1), "reason": reason}
 
 
-def _attachment(hold, file, cap):
-    """A row of ``attach``, with its tendon; it is not surer than ``cap``."""
+def _attachment(hold, muscle, stage, cap):
+    """A row of ``attach`` of a muscle, with its tendon; it is not surer than ``cap``."""
+    file = PurePosixPath(stage, attachment_file(muscle, hold.bone.name)).as_posix()
     guess = _confidence(min(hold.confidence, cap), hold.reason)
     if hold.tendon is None:
         return {"bone": hold.bone.name, "vertices": file, "guess": guess}
@@ -452,9 +454,7 @@ def _muscle(guess: MuscleGuess, stage: str) -> str:
     part = guess.muscle
     # What makes the muscle doubtful, not one attachment, makes all of them so.
     cap = guess.confidence if guess.doubted else 1.0
-    files = [attachment_file(part.name, hold.bone.name) for hold in guess.holds]
-    places = [PurePosixPath(stage, file).as_posix() for file in files]
-    attach = [_attachment(hold, place, cap) for hold, place in zip(guess.holds, places)]
+    attach = [_attachment(hold, part.name, stage, cap) for hold in guess.holds]
     row = {"name": part.name, "mesh": part.file, "attach": attach}
     head = _headed("[[muscle]]", part, guess.reasons)
     text = table_text(head, row, _doubt(part))

@@ -491,14 +491,19 @@ def _put_in_groove(joint, knee, millimetre):
     flexions = np.array(FLEXIONS, dtype=float)
 
     def table(direction, values):
-        spline = {"x": rounded(knee.rest + flexions, 3), "y": rounded(values, 6)}
-        return {"axis": rounded(direction, 6), "coordinates": ["flexion"], "spline": spline}
+        return {
+            "axis": rounded(direction, 6),
+            "coordinates": ["flexion"],
+            "spline": {"x": rounded(knee.rest + flexions, 3), "y": rounded(values, 6)},
+        }
 
     def place(point):
         return knee.centre + side * axis + point.real * front + point.imag * down
 
-    joint.tables["rotations"] = [table(axis, TURN * flexions)]
-    joint.tables["translations"] = [table(front, shifts.real), table(down, shifts.imag)]
+    joint.tables = {
+        "rotations": [table(axis, TURN * flexions)],
+        "translations": [table(front, shifts.real), table(down, shifts.imag)],
+    }
     joint.kind = "custom"
     joint.centre = place(middle)
     joint.confidence = 0.6

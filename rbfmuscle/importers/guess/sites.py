@@ -130,9 +130,8 @@ def _add_shank(found, femur, bones, joints, sign):
     lateral = axes[0]
     forward = unit(across(points.mean(axis=0) - heel.points.mean(axis=0), lateral))
     axes = np.stack([lateral, forward, sign * np.cross(lateral, forward)])
-    along = np.vstack([points, heel.points]) @ forward
-    frame = BoneFrame(ankle.centre, axes, float(np.ptp(along)))
-    _add(found, [b for b in side if b.kind in FEET], frame)
+    length = float(np.ptp(np.vstack([points, heel.points]) @ forward))
+    _add(found, [b for b in side if b.kind in FEET], BoneFrame(ankle.centre, axes, length))
 
 
 STEPS = 20  # points along a leg of a site's line

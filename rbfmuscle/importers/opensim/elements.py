@@ -10,7 +10,7 @@ import math
 import posixpath
 import re
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -367,9 +367,7 @@ class Reading:
         self.called: dict[str, str] = {}
         self._known: dict[str, tuple[str, np.ndarray]] = {}
         self._open: list[str] = []  # frames whose places are being sought
-        for node in element.iter():
-            if not isinstance(node, Node):
-                continue
+        for node in cast("Iterator[Node]", element.iter()):
             if node.tag == "Body" and node.name != GROUND:
                 if node.path in self.bodies:
                     raise SceneError(f"two bodies are named {node.name!r}; rename one")
