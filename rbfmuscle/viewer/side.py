@@ -95,7 +95,8 @@ class MarkView:
 
     def _show(self, name: str, points: Floats) -> None:
         """Show lines (k, 2, 3), or points (n, 3)."""
-        place, points = f"{self._root}/{name}", points * self._factor
+        place = f"{self._root}/{name}"
+        points = points * self._factor
         if place not in self._nodes and points.ndim == 3:
             colours = np.broadcast_to(np.array(AXIS_COLOUR), points.shape)
             self._nodes[place] = self._server.scene.add_line_segments(

@@ -332,7 +332,8 @@ def write_scene(guess: SceneGuess, path: Path, stage: Path) -> Scene:
                 about = next((m for m in guess.muscles if m.muscle.name == error.muscle), None)
                 if about is None or about.wrong:
                     raise
-                about.wrong, about.confidence = final(str(error)), 0.0
+                about.wrong = final(str(error))
+                about.confidence = 0.0
                 _check_runs(guess, path)
     finally:
         trial.unlink(missing_ok=True)

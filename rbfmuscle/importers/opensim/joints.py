@@ -71,7 +71,8 @@ def read_joint(reading: Reading, node: Node, ends: list[End], tag: str) -> None:
     else:
         turns, shifts = TAKEN[kind]
         own = [TransformAxis(axis, (plain[one],)) for axis, one in zip((*turns, *shifts), names)]
-        rotations, translations = tuple(own[: len(turns)]), tuple(own[len(turns) :])
+        rotations = tuple(own[: len(turns)])
+        translations = tuple(own[len(turns) :])
     joint = ModelJoint(
         name,
         parent,
