@@ -81,8 +81,9 @@ class SceneGuess:
 
 
 def _read_parts(found, units, base, source):
-    """Bones, muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and
-    ``tendons``; files relative to ``base``. Messages name the ``source`` of the meshes.
+    """Muscles and tendons of a folder, and of its folders ``bones``, ``muscles`` and ``tendons``;
+    bones, unit and notes go to the guess ``found``. Files are relative to ``base``, messages name
+    the ``source`` of the meshes.
 
     Where no unit is given it is the one in which the bones have the size that they have in people.
     """
