@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sparse
@@ -11,10 +10,10 @@ from scipy.sparse.linalg import cg
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size, unit
-from rbfmuscle.geometry.lines import distance_along, nearest_pieces, points_along
+from rbfmuscle.geometry.lines import nearest_pieces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.threads import each
-from rbfmuscle.metrics.centreline import moving_joints, split_ends
+from rbfmuscle.metrics.centreline import moving_joints, resampled, split_ends
 from rbfmuscle.metrics.rows import bones_about
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.objects import Muscle
@@ -119,26 +118,26 @@ class FluxField:
         at_ends = [self._cell_of(end) for end in ends]
         for cell in at_ends:
             inside[tuple(cell.T)] = True
-        if not self._joined(inside, at_ends):
+        piece, joined = self._piece(inside, at_ends)
+        if not joined:
             inside[tuple(self._cell_of(_surface_points(mesh, 0.4 * self.side)).T)] = True
-            if not self._joined(inside, at_ends):
+            piece, joined = self._piece(inside, at_ends)
+            if not joined:
                 raise np.linalg.LinAlgError("origin and insertion lie in separate pieces")
-        return np.argwhere(self._piece(inside, at_ends[0]))
+        return np.argwhere(piece)
 
     def _cell_of(self, points: Floats) -> Integers:
         return np.asarray(((points - self.low) / self.side).astype(int))
 
-    def _piece(self, inside: Booleans, start: Integers) -> Booleans:
-        """The cells joined to the one that most of the cells ``start`` (n, 3) are joined to."""
+    def _piece(self, inside: Booleans, ends: Sequence[Integers]) -> tuple[Booleans, bool]:
+        """The cells joined to the one that most of the origin's cells (n, 3) are joined to, and
+        whether most of the insertion's are among them.
+        """
         from scipy.ndimage import label
 
         labels = label(inside)[0]
-        at = labels[tuple(start.T)]
-        return np.asarray(labels == np.bincount(at).argmax())
-
-    def _joined(self, inside: Booleans, ends: Sequence[Integers]) -> bool:
-        piece = self._piece(inside, ends[0])
-        return bool(piece[tuple(ends[1].T)].mean() > 1 / 2)
+        piece = labels == np.bincount(labels[tuple(ends[0].T)]).argmax()
+        return piece, bool(piece[tuple(ends[1].T)].mean() > 1 / 2)
 
     def _source(self, ends: tuple[Floats, Floats]) -> Floats:
         """Flux (n,) into each node: one in all through the origin, as much out of the insertion."""
@@ -198,15 +197,11 @@ def _conductivity(points: Floats, polylines: Sequence[Floats] | None) -> Floats:
 def _element_matrices() -> Floats:
     """∫ ∂_i N_k ∂_j N_l over a unit cell, (3, 3, 8, 8), by two Gauss points along each axis."""
     gauss = 0.5 + (_CORNERS - 0.5) / np.sqrt(3.0)
-    out = np.zeros((3, 3, 8, 8))
-    for point in gauss:
-        factor = np.where(_CORNERS, point, 1.0 - point)
-        slope = np.empty((3, 8))
-        for axis in range(3):
-            others = [k for k in range(3) if k != axis]
-            slope[axis] = (2 * _CORNERS[:, axis] - 1) * factor[:, others].prod(axis=1)
-        out += np.einsum("ik,jl->ijkl", slope, slope) / 8.0
-    return out
+    # Of each point and corner: the factors of the shape function, one an axis, and its slopes.
+    factor = np.where(_CORNERS, gauss[:, None], 1.0 - gauss[:, None])
+    others = [np.delete(factor, axis, axis=2).prod(axis=2) for axis in range(3)]
+    slopes = np.stack(others, axis=1) * (2 * _CORNERS.T - 1)
+    return np.sum([np.einsum("ik,jl->ijkl", at, at) / 8.0 for at in slopes], axis=0)
 
 
 def _solve(matrix: sparse.csr_matrix, source: Floats) -> Floats:
@@ -222,15 +217,6 @@ def _solve(matrix: sparse.csr_matrix, source: Floats) -> Floats:
     return np.asarray(found)
 
 
-class Traced(NamedTuple):
-    """Fibres at rest: lines (n, `POINTS`, 3) from origin to insertion, and of both ends of each the
-    number (n, 2) of the point of the patches that it ends on.
-    """
-
-    lines: Floats
-    ends: Integers
-
-
 def trace_fibres(
     mesh: MeshDistance,
     ends: tuple[Floats, Floats],
@@ -238,7 +224,7 @@ def trace_fibres(
     *,
     polylines: Sequence[Floats] | None = None,
     bones: Sequence[BoneDistance] = (),
-) -> Traced:
+) -> tuple[Floats, Integers]:
     """Lines from origin to insertion along the flux between them, evenly by volume.
 
     Parameters
@@ -256,7 +242,10 @@ def trace_fibres(
 
     Returns
     -------
-    Traced
+    lines : (n, `POINTS`, 3) ndarray
+        From origin to insertion.
+    ends : (n, 2) ndarray of int
+        Of both ends of each line the number of the point of the patches that it ends on.
 
     Raises
     ------
@@ -265,15 +254,15 @@ def trace_fibres(
     """
     flux = FluxField(mesh, ends, polylines)
     seeds = even_seeds(mesh, int(np.ceil(SPARE * count)))
-    tracer = _Tracer(mesh, flux, ends)
-    back, origin = tracer.trace(seeds, -1)
-    ahead, insertion = tracer.trace(seeds, 1)
+    back, origin = _trace(seeds, -1, mesh, flux, ends[0])
+    ahead, insertion = _trace(seeds, 1, mesh, flux, ends[1])
     whole = np.flatnonzero((origin >= 0) & (insertion >= 0))[:count]
     lines = [np.concatenate([back[k][::-1], ahead[k][1:]]) for k in whole]
     if not lines:
         raise np.linalg.LinAlgError("no line reaches from the origin to the insertion")
-    even = _kept_inside(np.array([_even(line) for line in lines]), mesh, bones, DEPTH * flux.side)
-    return Traced(even, np.stack([origin[whole], insertion[whole]], axis=1))
+    even = np.array([resampled(line, POINTS - 1) for line in lines])
+    _keep_inside(even, mesh, bones, DEPTH * flux.side)
+    return even, np.stack([origin[whole], insertion[whole]], axis=1)
 
 
 def even_seeds(mesh: MeshDistance, count: int) -> Floats:
@@ -296,56 +285,41 @@ def even_seeds(mesh: MeshDistance, count: int) -> Floats:
     return found[:count]
 
 
-class _Tracer:
-    """Follows a flux from seeds to the patches at its ends."""
-
-    def __init__(self, mesh: MeshDistance, flux: FluxField, ends: tuple[Floats, Floats]) -> None:
-        from scipy.spatial import cKDTree
-
-        self.mesh = mesh
-        self.flux = flux
-        self.ends = [cKDTree(end) for end in ends]
-        self.step = STEP * flux.side
-        size = box_size(mesh.vertices)
-        self.most = int(LONGEST * size / self.step)
-
-    def trace(self, seeds: Floats, sense: int) -> tuple[list[Floats], Integers]:
-        """Lines from the seeds (n, 3) along the flux, or against it where ``sense`` is -1, and the
-        number (n,) of the patch's point at which each arrives, -1 where it does not.
-        """
-        patch = self.ends[(sense + 1) // 2]
-        lines = [[seed] for seed in seeds]
-        arrived = np.full(len(seeds), -1)
-        here = seeds.copy()
-        open_lines = np.arange(len(seeds))
-        for _ in range(self.most):
-            half = here + 0.5 * sense * self.step * unit(self.flux(here))
-            here = here + sense * self.step * unit(self.flux(half))
-            beyond = ~self.mesh.inside(here)
-            if beyond.any():  # back to the surface
-                here[beyond] = self.mesh.nearest(here[beyond])[1]
-            distance, nearest = patch.query(here)
-            # At the surface and nearer to the patch than a cell: it has come through it.
-            done = beyond & (distance < self.flux.side)
-            for k, line in enumerate(open_lines):
-                lines[line].append(patch.data[nearest[k]] if done[k] else here[k])
-            arrived[open_lines[done]] = nearest[done]
-            open_lines = open_lines[~done]
-            here = here[~done]
-            if not len(open_lines):
-                break
-        return [np.array(line) for line in lines], arrived
+def _trace(
+    seeds: Floats, sense: int, mesh: MeshDistance, flux: FluxField, end: Floats
+) -> tuple[list[Floats], Integers]:
+    """Lines from the seeds (n, 3) along the flux, or against it where ``sense`` is -1, and the
+    number (n,) of the patch's point (k, 3) at which each arrives, -1 where it does not.
+    """
+    patch = cKDTree(end)
+    step = STEP * flux.side
+    lines = [[seed] for seed in seeds]
+    arrived = np.full(len(seeds), -1)
+    here = seeds.copy()
+    open_lines = np.arange(len(seeds))
+    for _ in range(int(LONGEST * box_size(mesh.vertices) / step)):
+        half = here + 0.5 * sense * step * unit(flux(here))
+        here = here + sense * step * unit(flux(half))
+        beyond = ~mesh.inside(here)
+        if beyond.any():  # back to the surface
+            here[beyond] = mesh.nearest(here[beyond])[1]
+        distance, nearest = patch.query(here)
+        # At the surface and nearer to the patch than a cell: it has come through it.
+        done = beyond & (distance < flux.side)
+        for k, line in enumerate(open_lines):
+            lines[line].append(patch.data[nearest[k]] if done[k] else here[k])
+        arrived[open_lines[done]] = nearest[done]
+        open_lines = open_lines[~done]
+        here = here[~done]
+        if not len(open_lines):
+            break
+    return [np.array(line) for line in lines], arrived
 
 
-def _even(line: Floats) -> Floats:
-    """`POINTS` at even distances along a line (n, 3)."""
-    return points_along(line, np.linspace(0.0, distance_along(line)[-1], POINTS))
-
-
-def _kept_inside(
+def _keep_inside(
     lines: Floats, mesh: MeshDistance, bones: Sequence[BoneDistance], depth: float
-) -> Floats:
-    """Lines (n, k, 3) smoothed, their inner points moved inside the muscle and out of bones."""
+) -> None:
+    """Smooth lines (n, k, 3), and move their inner points inside the muscle and out of bones."""
     inner = lines[:, 1:-1]
     for _ in range(ROUNDS):
         smooth = 0.25 * (lines[:, :-2] + 2.0 * inner + lines[:, 2:])
@@ -354,7 +328,6 @@ def _kept_inside(
             points = _moved_off(points, bone, 1.0, 0.0)
         points = _moved_off(points, mesh, -1.0, depth)
         inner[:] = points.reshape(inner.shape)
-    return lines
 
 
 def _moved_off(points: Floats, mesh: MeshDistance, side: float, depth: float) -> Floats:
@@ -383,8 +356,8 @@ class FibreBundle:
         probes = [bone.exact for bone in scene.bones]
         near = bones_about(mesh.vertices, probes, {probe.name: np.eye(4) for probe in probes})
         first, last = sheets or [points for points, _ in patches]
-        traced = trace_fibres(mesh, (first, last), count, polylines=muscle.fibres, bones=near)
-        self.rest = traced.lines
+        ends = (first, last)
+        self.rest, _ = trace_fibres(mesh, ends, count, polylines=muscle.fibres, bones=near)
         self.attachment_frames = [a.attachment_frame for group in groups for a in group]
         self.pennate = bool(sheets)
         held = [
@@ -405,28 +378,24 @@ class FibreBundle:
         tendons by the end that each holds.
         """
         belly = self._follow().reshape(self.rest.shape)
-        held = [self._carried(end, poses) for end in (0, 1)]
+        # Held points (N, 2, 3) of both ends where their bones, or ends of tendons, carry them.
+        pose = np.array([poses[name] for name in self.attachment_frames])[self._held]
+        held = np.einsum("neij,nej->nei", pose[:, :, :3, :3], self._anchors) + pose[:, :, :3, 3]
         if not self.pennate:
-            belly[:, 0], belly[:, -1] = held
+            belly[:, [0, -1]] = held
         now = _segments(belly)
         ratio = now / self._segments
         local = np.empty((len(belly), POINTS))
         local[:, 1:-1] = 0.5 * (ratio[:, 1:] + ratio[:, :-1])
         local[:, [0, -1]] = ratio[:, [0, -1]]
         before, after = (
-            self._beyond(end, belly[:, place], held[end], tendons)
+            self._beyond(end, belly[:, place], held[:, end], tendons)
             for end, place in ((0, 0), (1, -1))
         )
         points = np.concatenate([before[:, ::-1], belly, after], axis=1)
         still = [np.ones(part.shape[:2]) for part in (before, after)]
         stretch = now.sum(axis=1) / self._segments.sum(axis=1)
         return FibreLines(points, stretch, np.concatenate([still[0], local, still[1]], axis=1))
-
-    def _carried(self, end: int, poses: Mapping[str, Floats]) -> Floats:
-        """Held points (N, 3) of an end where their bones, or ends of tendons, carry them."""
-        pose = np.array([poses[name] for name in self.attachment_frames])[self._held[:, end]]
-        turned = np.einsum("nij,nj->ni", pose[:, :3, :3], self._anchors[:, end])
-        return np.asarray(turned + pose[:, :3, 3])
 
     def _beyond(
         self, end: int, tips: Floats, held: Floats, tendons: Mapping[str, TendonLine]
