@@ -14,7 +14,7 @@ import scipy.sparse as sparse
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from rbfmuscle.geometry.arrays import Floats, Integers, to_local
+from rbfmuscle.geometry.arrays import Floats, Integers, to_local, unit
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.geometry.lines import distance_along, line_length, points_along
 from rbfmuscle.geometry.mesh_distance import MeshDistance
@@ -291,9 +291,7 @@ def belly_measures(
 
 def _thickness(points: Floats, axis: Floats) -> float:
     """Least width of a section's points over all directions across the axis."""
-    helper = np.eye(3)[np.argmin(np.abs(axis))]
-    u = np.cross(axis, helper)
-    u /= np.linalg.norm(u)
+    u = unit(np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))]))
     v = np.cross(axis, u)
     angle = np.pi * np.arange(CALIPERS) / CALIPERS
     directions = np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v

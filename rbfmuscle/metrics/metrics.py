@@ -53,12 +53,11 @@ class MuscleMeasures:
         surfaces = scene_surfaces(scene)
         guessed = guessed_muscles(scene.guesses)
         mine = [muscle for muscle in scene.muscles if muscle.name in material]
-        trackers = each(lambda one: MuscleMeasurer(one, scene, *material[one.name]), mine)
-        self.trackers = {tracker.name: tracker for tracker in trackers}
+        self.trackers = each(lambda one: MuscleMeasurer(one, scene, *material[one.name]), mine)
         given = InputNeighbours(mine, scene.units)
         self.neighbours, self._carried = NeighbourMeasures(given), NeighbourMeasures(given)
-        for muscle in mine:
-            self.trackers[muscle.name].first = {
+        for muscle, tracker in zip(mine, self.trackers):
+            tracker.once = {
                 "neighbour_overlap_rest": given.deepest(muscle.name),
                 "articular_share": articular_share(muscle, scene, surfaces)[0],
                 "end_gap": end_gap(muscle, scene)[0],
@@ -77,18 +76,15 @@ class MuscleMeasures:
 
         The values are among those of the first frame that is measured.
         """
-        trackers = list(self.trackers.values())
         given = self.probes, poses
-        each(lambda t: t.measure_rest(surfaces[t.name], material[t.name], *given), trackers)
+        each(lambda t: t.measure_rest(surfaces[t.name], material[t.name], *given), self.trackers)
 
     def measure(self, frame: Frame) -> dict[str, Values]:
         """Measure a frame: for each muscle its values by quantity, in the order of `QUANTITIES`."""
-        trackers = list(self.trackers.values())
-        found = dict(
-            zip(self.trackers, each(lambda tracker: tracker.measure(frame, self.probes), trackers))
-        )
-        shown = {t.name: t.shown for t in trackers if t.name in frame.surfaces and t.shown}
-        carried = {t.name: t.carried for t in trackers if t.name in shown and t.carried}
+        measured = each(lambda tracker: tracker.measure(frame, self.probes), self.trackers)
+        found = {tracker.name: values for tracker, values in zip(self.trackers, measured)}
+        shown = {t.name: t.shown for t in self.trackers if t.name in frame.surfaces and t.shown}
+        carried = {t.name: t.carried for t in self.trackers if t.name in shown and t.carried}
         apart = self.neighbours.measure(frame.index, shown)
         within = apart
         if any(carried[name] is not surface for name, surface in shown.items()):
@@ -114,8 +110,8 @@ class MuscleMeasurer:
         self.least, self.around = from_mm(OVERLAP, scene.units), from_mm(AROUND, scene.units)
         self.rest_volume = float(muscle.mesh.volume)
         self.edges = EdgeLengths(vertices, faces)
-        #: What is measured once, with the first frame.
-        self.first: dict[str, float] = {}
+        #: What is measured once, until the first frame takes it.
+        self.once: Values = {}
         self.ends = [
             attachment.attachment_frame for attachment in muscle.attachments if attachment.tendon
         ]
@@ -126,10 +122,7 @@ class MuscleMeasurer:
             self.line = Centreline(muscle, scene.joints, vertices, faces, moving=moving)
         self.form = SurfaceForm()
         self.material = vertices
-        self.at_rest: Values = {}  # what was measured there, until the first frame takes it
         # Of the last surface.
-        self.distance: MeshDistance | None = None
-        self.places: Floats | None = None  # of its vertices at rest
         self.shown: Shown | None = None
         self.carried: Shown | None = None  # the material, which may be what is shown
         self.offset: Floats | None = None
@@ -138,8 +131,8 @@ class MuscleMeasurer:
 
     def measure(self, frame: Frame, probes: list[BoneDistance]) -> dict[str, float]:
         """What there is to measure of this muscle in a frame."""
-        found = {**self.first, **self.at_rest}
-        self.first, self.at_rest = {}, {}
+        found = self.once
+        self.once = {}
         lines = [frame.tendons[end].points[1:-1] for end in self.ends if end in frame.tendons]
         points = np.concatenate([np.empty((0, 3)), *lines])
         depth = surface_depth(points, probes, frame.poses)
@@ -148,7 +141,7 @@ class MuscleMeasurer:
         if surface is not None:
             found.update(self._of_surface(frame.index, surface, material, probes, frame.poses))
             # The material as a surface of its own, unless it is shown.
-            if self.shown is not None and np.array_equal(self.shown.distance.vertices, material):
+            if np.array_equal(surface.vertices, material):
                 self.carried = self.shown
             else:
                 layout = None if self.carried is None else self.carried.distance.layout
@@ -180,13 +173,14 @@ class MuscleMeasurer:
 
     def _of_surface(self, index, surface, material, probes, poses):
         vertices, faces = surface.vertices, np.asarray(surface.faces)
-        # Surfaces that keep their faces share the order of the tree.
-        same = self.distance is not None and np.array_equal(self.distance.faces, faces)
-        layout = self.distance.layout if same else None
-        self.distance = MeshDistance(vertices, faces, layout=layout)
-        if not same or self.places is None:
-            self.places = self._places_at_rest(vertices, material)
-        self.shown = Shown(self.distance, self.places)
+        # Surfaces that keep their faces share the order of the tree, and places at rest.
+        same = self.shown is not None and np.array_equal(self.shown.distance.faces, faces)
+        if same:
+            distance = MeshDistance(vertices, faces, layout=self.shown.distance.layout)
+            self.shown = Shown(distance, self.shown.at_rest)
+        else:
+            distance = MeshDistance(vertices, faces)
+            self.shown = Shown(distance, self._places_at_rest(vertices, material))
         volume = mesh_volume(vertices, faces)
         depth = surface_depth(vertices, probes, poses)
         form = self.form.measure(surface, same_faces=same)
@@ -195,12 +189,12 @@ class MuscleMeasurer:
             "volume_error": volume / self.rest_volume - 1.0,
             "penetration_max": depth.max(),
             "penetration_fraction": np.mean(depth > 0.0),
-            "bone_penetration_max": bone_depth(self.distance, probes, poses),
+            "bone_penetration_max": bone_depth(distance, probes, poses),
             **form,
-            **self._flicker(index, material, vertices, same, self.form.simple),
+            **self._flicker(index, material, vertices, same),
         }
 
-    def _flicker(self, index, material, vertices, same, simple):
+    def _flicker(self, index, material, vertices, same):
         """Distances of the material to the surface, and their change since the frame before in the
         motion, where that was measured; of a mesh that is shown, none.
         """
@@ -209,7 +203,8 @@ class MuscleMeasurer:
         if self.near is None or not same:
             self.near = np.full(len(material), -1)
         before, last = self.offset, self.index
-        self.offset = self.distance.signed(material, near=self.near, simple=simple)
+        distance = self.shown.distance
+        self.offset = distance.signed(material, near=self.near, simple=self.form.simple)
         self.index = index
         away = np.abs(self.offset)
         found = {"shown_shift_rms": math.sqrt(np.mean(away**2)), "shown_shift_max": away.max()}
@@ -233,8 +228,8 @@ class MuscleMeasurer:
         mesh = np.asarray(self.mesh.vertices, dtype=float), np.asarray(self.mesh.faces)
         given = MeshDistance(*mesh)
         # Its tree is that of the first frame too.
-        shown = self.distance = MeshDistance(surface.vertices, surface.faces)
-        self.places = self._places_at_rest(shown.vertices, material)
+        shown = MeshDistance(surface.vertices, surface.faces)
+        self.shown = Shown(shown, self._places_at_rest(shown.vertices, material))
         places, deepest = bone_overlap(given, self.held, probes, poses, self.least)
         found = {"input_overlap": deepest, **rest_errors(shown, given, places, self.around)}
         found["initial_overlap"] = max(
@@ -244,7 +239,7 @@ class MuscleMeasurer:
         if self.line is not None:
             found["thickness"] = self.line.section(*mesh, poses)["belly_thickness"]
             found["bowing_at_rest"] = self.line.measure(self.material, poses, probes)[1]
-        self.at_rest = found
+        self.once |= found
 
     def _places_at_rest(self, vertices: Floats, material: Floats) -> Floats:
         """Where vertices (n, 3) of a surface lie in the input, from the material (k, 3) there."""

@@ -52,16 +52,6 @@ class Side:
     allowed: Floats | None
 
 
-@dataclass
-class PairFacts:
-    """Worst values of a pair over the frames [scene unit], and the frames."""
-
-    overlap: float = 0.0
-    overlap_frame: int = 0
-    gap: float = 0.0
-    gap_frame: int = 0
-
-
 class InputNeighbours:
     """Muscles as the input has them: distances to their meshes, and which of these overlap."""
 
@@ -106,7 +96,8 @@ class NeighbourMeasures:
         self._places: dict[str, Floats] = {}
         self._sides: dict[tuple[str, str], Side] = {}
         self._touched: set[tuple[str, str]] = set()
-        self.pairs: dict[tuple[str, str], PairFacts] = {}
+        # Of pairs that met or touched: frame, overlap beyond rest, gap.
+        self._met: dict[tuple[str, str], list[tuple[int, float, float]]] = {}
 
     def measure(self, index: int, shown: Mapping[str, Shown]) -> dict[str, dict[str, float]]:
         """Values of each muscle that is shown, in the frame of this number."""
@@ -131,7 +122,8 @@ class NeighbourMeasures:
                 overlap[name] = max(overlap[name], deepest)
                 gaps[name].append(gap)
             if deepest > 0.0 or (one, other) in self._touched:
-                self._keep((one, other), index, deepest, _percentile(parted))
+                values = index, deepest, _percentile(parted)
+                self._met.setdefault((one, other), []).append(values)
         return {
             name: {"neighbour_overlap_max": overlap[name], "neighbour_gap": _percentile(gaps[name])}
             for name in names
@@ -139,27 +131,22 @@ class NeighbourMeasures:
 
     def table(self) -> list[dict[str, object]]:
         """Pairs that met or touched, the deepest overlap first [scene unit]."""
-        ordered = sorted(self.pairs.items(), key=lambda found: -found[1].overlap)
-        return [
-            {
+        rows = []
+        for pair, met in self._met.items():
+            frames, overlaps, gaps = zip(*met)
+            deepest = int(np.argmax(overlaps))
+            widest = int(np.argmax(gaps))
+            at_rest = self.input.overlaps.get(pair)
+            row = {
                 "muscles": list(pair),
-                "overlap_max": worst.overlap,
-                "overlap_frame": worst.overlap_frame,
-                "overlap_rest": float(self.input.overlaps[pair].depths.max())
-                if pair in self.input.overlaps
-                else 0.0,
-                "gap": worst.gap,
-                "gap_frame": worst.gap_frame,
+                "overlap_max": overlaps[deepest],
+                "overlap_frame": frames[deepest],
+                "overlap_rest": 0.0 if at_rest is None else float(at_rest.depths.max()),
+                "gap": gaps[widest],
+                "gap_frame": frames[widest],
             }
-            for pair, worst in ordered
-        ]
-
-    def _keep(self, pair: tuple[str, str], index: int, overlap: float, gap: float) -> None:
-        worst = self.pairs.setdefault(pair, PairFacts(overlap_frame=index, gap_frame=index))
-        if overlap > worst.overlap:
-            worst.overlap, worst.overlap_frame = overlap, index
-        if gap > worst.gap:
-            worst.gap, worst.gap_frame = gap, index
+            rows.append(row)
+        return sorted(rows, key=lambda row: -row["overlap_max"])
 
     def _pair(
         self, row: tuple[str, str, bool], shown: Mapping[str, Shown]

@@ -90,14 +90,14 @@ def frame_rows(
     """Rows of one frame from values by muscle and quantity; ``before`` are the last frame's
     coordinates, or None.
     """
-    # The coordinate that moved most to reach the frame, and its value there.
+    # The coordinate that moved most to reach the frame, else the first, and its value there.
     now = frame.coordinates
     names = scene.motion.coordinates or list(now)
-    name = names[0] if names else ""
+    name = ""
     angle = 0.0
-    if names and before is not None:
-        name = max(names, key=lambda n: abs(now.get(n, 0.0) - before.get(n, 0.0)))
     if names:
+        earlier = now if before is None else before
+        name = max(names, key=lambda n: abs(now.get(n, 0.0) - earlier.get(n, 0.0)))
         angle = shown_value(scene, name, now.get(name, 0.0))
     together = dict(measured.get(ALL, {}))
     time = scene.motion.time(frame.index)
@@ -135,11 +135,10 @@ def moment_arm_rows(
     guessed = guessed_muscles(scene.guesses)
     places = {index: place for place, index in enumerate(path)}
     for muscle, found in lengths.items():
-        along = np.array([found.get(index, math.nan) for index in path])
         active = activations.get(muscle, {})
         arms = [
             row._replace(muscle=muscle, value=float(moments))
-            for moments, row in _moments(scene, path, along, active)
+            for moments, row in _moments(scene, path, found, active)
         ]
         rows += arms
         for name in dict.fromkeys(row.coordinate for row in arms):
@@ -150,10 +149,7 @@ def moment_arm_rows(
                 rows += _smoothness(part, guessed=muscle in guessed)
                 rows += _roughness(part, found, shortest.get(muscle, {}))
     for muscle, of_fibres in fibres.items():
-        none = np.full(len(next(iter(of_fibres.values()))), math.nan)
-        along = np.array([of_fibres.get(index, none) for index in path])
-        active = activations.get(muscle, {})
-        for moments, row in _moments(scene, path, along, active):
+        for moments, row in _moments(scene, path, of_fibres, activations.get(muscle, {})):
             for quantity, value in percentiles("fibre_moment_arm", moments).items():
                 rows.append(row._replace(muscle=muscle, quantity=quantity, value=value))
     return rows
@@ -254,18 +250,21 @@ def _before(angles: Floats, k: int) -> int:
     return int(away[-1]) if len(away) else k
 
 
-def _moments(scene, path, lengths, active):
+def _moments(scene, path, found, active):
     """Moment arms along a path, each with a row that says where, as `moment_arms` finds them; NaN
-    where a coordinate moves alone while the activation changes.
+    where a coordinate moves alone while the activation changes. Lengths () or (N,), and
+    activations, are by frame.
     """
+    unknown = np.full(np.shape(next(iter(found.values()))), math.nan)
+    lengths = np.array([found.get(index, unknown) for index in path])
     known = all_coordinates(scene.joints)
     shifts = {name for name, fact in known.items() if fact.motion == "translation"}
     names = {name for coordinates in path.values() for name in coordinates}
     reach = reaches(names, shifts, scene.units)
     frames = list(path.values())
-    found = moment_arms(frames, lengths, reach, [active.get(index, 0.0) for index in path])
-    everywhere = moment_arms(frames, lengths, reach) if active else found
-    for (index, coordinates), moments, wanted in zip(path.items(), found, everywhere):
+    arms = moment_arms(frames, lengths, reach, [active.get(index, 0.0) for index in path])
+    everywhere = moment_arms(frames, lengths, reach) if active else arms
+    for (index, coordinates), moments, wanted in zip(path.items(), arms, everywhere):
         for name, whole in wanted.items():
             angle = shown_value(scene, name, coordinates.get(name, 0.0))
             unit = "1" if name in shifts else scene.units

@@ -274,14 +274,14 @@ def parse_limits(limits: str | Sequence[str] | None, scene: Scene) -> Limits:
             if not math.isfinite(number) or number < 0:
                 raise UsageError(f"fail_on {part}: the limit must be a number, zero or more")
             found[name] = number
-    values = {name: _in_unit(LIMITS[name].value, name, scene.units) for name in LIMITS}
-    return Limits(
-        values | {name: value for name, value in found.items() if value is not None}, found
-    )
-
-
-def _in_unit(value, quantity, unit):
-    return from_mm(value, unit) if QUANTITIES[quantity][0] == "length" else value
+    values = {name: limit.value for name, limit in LIMITS.items()}
+    values |= {
+        name: from_mm(value, scene.units)
+        for name, value in values.items()
+        if QUANTITIES[name][0] == "length"
+    }
+    values |= {name: value for name, value in found.items() if value is not None}
+    return Limits(values, found)
 
 
 def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, QuantityFacts]) -> float:
@@ -292,20 +292,20 @@ def muscle_limit(quantity: str, limits: Limits, found: Mapping[str, QuantityFact
     limit = limits.values[quantity]
     if limits.is_given(quantity):
         return limit
+    first = {name: facts.get("first") for name, facts in found.items()}
+    thickness = first.get("thickness")
+    at_rest = first.get("bowing_at_rest")
     if quantity == "end_gap":
-        if not found.get("guessed", {}).get("first") and not limits.is_named(quantity):
+        if not first.get("guessed") and not limits.is_named(quantity):
             return math.inf
-        length = found.get("length", {}).get("first")
+        length = first.get("length")
         return limit if length is None else min(limit, END_SHARE * length)
-    if quantity == "rest_error_rms" and "thickness" in found:
+    if quantity == "rest_error_rms" and thickness is not None:
         unit = found["thickness"]["unit"]
-        thickness = found["thickness"]["first"]
-        thin = thickness is not None and thickness < _in_unit(THIN, "thickness", unit)
-        return _in_unit(THIN_REST_ERROR, quantity, unit) if thin else limit
-    at_rest = found.get("bowing_at_rest", {}).get("first")
-    return (
-        max(limit, at_rest + MORE_BOWING) if quantity == "bowing" and at_rest is not None else limit
-    )
+        return from_mm(THIN_REST_ERROR, unit) if thickness < from_mm(THIN, unit) else limit
+    if quantity == "bowing" and at_rest is not None:
+        return max(limit, at_rest + MORE_BOWING)
+    return limit
 
 
 def meets_limit(quantity: str, worst: float, limit: float) -> bool:

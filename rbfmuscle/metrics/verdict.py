@@ -85,8 +85,18 @@ def describe_details(
 ) -> list[str]:
     """The sentences of a verdict after its outcome."""
     texts = []
-    if verdict.beyond:
-        texts += _worst_and_remedies(verdict.beyond, table, missing_bones)
+    named = worst_first(verdict.beyond)[:MOST_NAMED]
+    if named:
+        values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
+        left = len(verdict.beyond) - len(named)
+        texts.append(f"Worst: {values}" + (f" and {left} more" if left else ""))
+    remedies: dict[str, str] = {}
+    for row in named:
+        if quantity_of(row.quantity) in LIMITS:
+            remedy = find_remedy(row, table)
+            remedies.setdefault(remedy, remedy.replace("FRAME", str(row.frame)))
+    if remedies:
+        texts.append(f"What to do: {'; '.join(remedies.values())}")
     if verdict.not_measured and set(table) - {ALL}:
         texts.append(f"Not measured: {describe_unmeasured(verdict.not_measured)}")
     if verdict.doubts:
@@ -110,19 +120,6 @@ def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
         by_quantity.setdefault(quantity, []).extend([] if muscle == ALL else [muscle])
     texts = [f"{q}{f' of {listed(n, MOST_NAMED)}' if n else ''}" for q, n in by_quantity.items()]
     return listed(texts, MOST_NAMED, separator="; ")
-
-
-def _worst_and_remedies(found, table, missing_bones):
-    named = worst_first(found)[:MOST_NAMED]
-    remedies: dict[str, str] = {}
-    for row in named:
-        if quantity_of(row.quantity) in LIMITS:
-            remedy = find_remedy(row, table)
-            remedies.setdefault(remedy, remedy.replace("FRAME", str(row.frame)))
-    values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
-    more = f" and {len(found) - len(named)} more" if len(found) > len(named) else ""
-    to_do = [f"What to do: {'; '.join(remedies.values())}"] if remedies else []
-    return [f"Worst: {values}{more}", *to_do]
 
 
 def worst_first(found: Sequence[Exceedance]) -> list[Exceedance]:
