@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, unit
 from rbfmuscle.geometry.lines import distance_along, tube_mesh
 from rbfmuscle.geometry.surfaces import joined_meshes
 from rbfmuscle.run.info import JointInfo
@@ -76,9 +76,7 @@ def muscle_groups(
         names = [joint.name for joint in joints if joint.child in crossed & carrying]
         if len(joints) == 1 and crossed:
             names = [joints[0].name]
-        shared = [
-            bone for bone in (chains[0] if chains else []) if all(bone in one for one in chains)
-        ]
+        shared = [bone for one in chains[:1] for bone in one if bone not in crossed]
         along = f"along {shared[0]}" if shared else "without a joint"
         groups[muscle] = f"across {', '.join(names)}" if names else along
     return groups
@@ -135,10 +133,8 @@ def view_axes(direction: Sequence[float] | Floats, body: Floats) -> Floats:
     """Right, up (superior, else anterior) and towards the camera (3, 3), from a direction along the
     body's axes.
     """
-    ahead = np.asarray(direction, dtype=float) @ body
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(body[2] if abs(ahead @ body[2]) < UPRIGHT else -body[1], ahead)
-    right /= np.linalg.norm(right)
+    ahead = unit(np.asarray(direction, dtype=float) @ body)
+    right = unit(np.cross(body[2] if abs(ahead @ body[2]) < UPRIGHT else -body[1], ahead))
     return np.stack([right, np.cross(ahead, right), ahead])
 
 

@@ -22,7 +22,7 @@ from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import moment_arms, reaches
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
-from rbfmuscle.run.vtk_files import fibre_file, read_fibres, read_vtp
+from rbfmuscle.run.vtk_files import frame_file, read_fibres, read_vtp
 from rbfmuscle.scene.joints import full_name
 from rbfmuscle.scene.meshes.repair import InputOrder
 from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
@@ -148,9 +148,20 @@ class RunData:
     def load(cls, directory: str | Path) -> Self:
         """Return the run in a folder, or raise UsageError if it holds none.
 
-        Of a run that was killed, or still goes on, it has the frames up to the last whole one.
+        Of a run that was killed, or still goes on, it has the frames up to the last whole one. The
+        frames lack what no file holds: material surfaces, and times of single muscles.
         """
-        return cls(*read_run(Path(directory)))
+        folder = Path(directory)
+        info = read_info(folder)
+        poses = _read_poses(folder)
+        if info.status == "running":
+            info = info.model_copy(update={"frames": _whole_frames(info, folder, poses)})
+        metrics = _read_table(
+            folder,
+            "metrics.csv",
+            lambda r: Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]),
+        )
+        return cls(info, _read_frames(info, folder, poses), metrics, FolderMeshes(folder))
 
     def frame(self, number: int) -> Frame:
         """The frame of a number; of a negative one counted from the end."""
@@ -333,8 +344,11 @@ def frame_caption(run: RunData, number: int) -> str:
     units = run.info.scene.coordinate_units
     spans = {name: np.ptp(np.nan_to_num(run.coordinates[name])) for name in entry.coordinates}
     most = sorted(spans, key=lambda name: -spans[name])[:MOST_SHOWN]
-    values = [(name, value) for name, value in entry.coordinates.items() if name in most]
-    texts = [f"{name} {value:.4g}{units.get(name, '°')}" for name, value in values]
+    texts = [
+        f"{name} {value:.4g}{units.get(name, '°')}"
+        for name, value in entry.coordinates.items()
+        if name in most
+    ]
     clock = [] if entry.time is None else [f"{entry.time:.4g} s"]
     return ", ".join([f"frame {number}", *clock, *texts])
 
@@ -411,7 +425,8 @@ class FolderMeshes:
 
     def tendons(self, muscle: str, frame: Frame) -> Mesh:
         """All tendons of a muscle in a frame."""
-        return read_vtp(surface_file(self.directory, tendon_name(muscle), frame.index))
+        file = frame_file("surfaces", tendon_name(muscle), frame.index)
+        return read_vtp(self.directory / file)
 
 
 class ReadFiles(Mapping[str, _Content]):
@@ -432,11 +447,6 @@ class ReadFiles(Mapping[str, _Content]):
 
 def _read_surface(path: Path) -> ModelSurface:
     return ModelSurface(*read_vtp(path))
-
-
-def surface_file(directory: Path, name: str, frame: int) -> Path:
-    """File of a muscle's surface, or of its tendons, in a frame."""
-    return directory / "surfaces" / f"{name}_{frame:04d}.vtp"
 
 
 def read_info(directory: Path) -> RunInfo:
@@ -463,24 +473,6 @@ def read_info(directory: Path) -> RunInfo:
         what = f"{place} = {first['input']!r}: {first['msg']}" if first else str(error)
         message = f"{path} is not the run.json of a run ({what[:300]}); run the scene again"
         raise UsageError(message) from None
-
-
-def read_run(directory: Path) -> tuple[RunInfo, list[Frame], list[Row], FolderMeshes]:
-    """Facts, frames, metrics and meshes of the run in a folder, UsageError if it holds none.
-
-    The frames lack what no file holds: material surfaces, and times of single muscles.
-    """
-    info = read_info(directory)
-    poses = _read_poses(directory)
-    if info.status == "running":
-        info = info.model_copy(update={"frames": _whole_frames(info, directory, poses)})
-    frames = _read_frames(info, directory, poses)
-    metrics = _read_table(
-        directory,
-        "metrics.csv",
-        lambda r: Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]),
-    )
-    return info, frames, metrics, FolderMeshes(directory)
 
 
 def _read_table(directory: Path, name: str, read: Callable[[list[str]], _Row]) -> list[_Row]:
@@ -527,7 +519,7 @@ def _whole_frames(info: RunInfo, directory: Path, poses: Poses) -> list[FrameInf
         )
         for place, (frame, placed) in enumerate(poses.items())
         if set(placed) >= bones
-        and all(surface_file(directory, name, frame).is_file() for name in meshes)
+        and all((directory / frame_file("surfaces", name, frame)).is_file() for name in meshes)
     ]
 
 
@@ -552,8 +544,8 @@ def _read_frames(info: RunInfo, directory: Path, poses: Poses) -> list[Frame]:
                 "again"
             )
         shown = muscles if scene.output.surfaces else []
-        surfaces = {name: surface_file(directory, name, index) for name in shown}
-        fibres = {name: directory / fibre_file(name, index) for name in muscles}
+        surfaces = {name: directory / frame_file("surfaces", name, index) for name in shown}
+        fibres = {name: directory / frame_file("fibres", name, index) for name in muscles}
         fibres = {name: file for name, file in fibres.items() if file.is_file()}
         frame = Frame(
             index,

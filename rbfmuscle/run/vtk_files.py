@@ -21,6 +21,7 @@ from rbfmuscle.simulation.frame import FibreLines
 from rbfmuscle.validation import MeshError
 
 _TYPES = {"Float64": "<f8", "Float32": "<f4", "Int32": "<i4"}  # of VTK, in NumPy's words
+_KINDS = {code: kind for kind, code in _TYPES.items()}
 NORMALS = "normals"  # name of the array that VTK takes for them
 _PARTS = ("PointData", "CellData", "Points", "Lines", "Polys")
 _HEAD = """<?xml version="1.0"?>
@@ -45,9 +46,8 @@ class Block(NamedTuple):
 
     part: str  # that it belongs to, one of `_PARTS`
     name: str
-    kind: str  # VTK's type
-    width: int  # numbers of one element
-    data: bytes  # as VTK stores them
+    values: Array  # (n,) or (n, k), of one of `_TYPES`
+    same: bool = False  # whether a mesh has it alike in every frame
 
 
 def write_vtp(
@@ -62,30 +62,19 @@ def write_vtp(
     in single precision; the ``name`` of the mesh as an array "name" of its field data, as PyVista
     does not read those of a collection.
     """
-    points, corners = np.asarray(vertices), np.asarray(faces)
-    blocks = [
-        made_block(
-            "PointData", key, values, "Float32", same=not (np.size(values) and np.ptp(values))
-        )
-        for key, values in (arrays or {}).items()
-    ]
-    kind = "Float32" if points.dtype == np.float32 else "Float64"
+    single = np.asarray(vertices).dtype == np.float32
+    points = np.asarray(vertices, dtype="<f4" if single else "<f8")
+    corners = np.asarray(faces, dtype="<i4")
+    blocks = []
+    for key, values in (arrays or {}).items():
+        same = not (np.size(values) and np.ptp(values))
+        blocks.append(Block("PointData", key, np.asarray(values, dtype="<f4"), same))
     blocks += [
-        made_block("Points", "Points", points, kind),
-        made_block("Polys", "connectivity", corners.ravel(), "Int32", same=True),
-        made_block("Polys", "offsets", np.arange(3, corners.size + 1, 3), "Int32", same=True),
+        Block("Points", "Points", points),
+        Block("Polys", "connectivity", corners.ravel(), same=True),
+        Block("Polys", "offsets", np.arange(3, corners.size + 1, 3, dtype="<i4"), same=True),
     ]
     write_blocks(path, blocks, points=len(points), faces=len(corners), name=name)
-
-
-def made_block(part: str, name: str, values: ArrayLike, kind: str, *, same: bool = False) -> Block:
-    """The block of an array (n,) or (n, k); ``same`` is one that a mesh has alike in every
-    frame.
-    """
-    array = np.ascontiguousarray(values, dtype=_TYPES[kind])
-    width = 1 if array.ndim == 1 else array.shape[1]
-    data = (_packed_once if same else _packed)(array.tobytes())
-    return Block(part, name, kind, width, data)
 
 
 def write_blocks(
@@ -101,13 +90,15 @@ def write_blocks(
     held = [block.name for block in blocks if block.part == "PointData"]
     marked = f' Normals="{NORMALS}"' if NORMALS in held else ""
     elements = dict.fromkeys(_PARTS, "")
-    offset = 0
+    data = b""
     for block in blocks:
+        kind = _KINDS[block.values.dtype.str]
+        width = 1 if block.values.ndim == 1 else block.values.shape[1]
         elements[block.part] += (
-            f'<DataArray type="{block.kind}" Name="{escape(block.name)}" '
-            f'NumberOfComponents="{block.width}" format="appended" offset="{offset}"/>\n'
+            f'<DataArray type="{kind}" Name="{escape(block.name)}" '
+            f'NumberOfComponents="{width}" format="appended" offset="{len(data)}"/>\n'
         )
-        offset += len(block.data)
+        data += (_packed_once if block.same else _packed)(block.values.tobytes())
     parts = "".join(
         f"<{part}{marked if part == 'PointData' else ''}>\n{text}</{part}>\n"
         for part, text in elements.items()
@@ -115,8 +106,7 @@ def write_blocks(
     )
     fields = _NAME.format(" ".join(map(str, [*name.encode(), 0]))) if name else ""
     head = _HEAD.format(points=points, lines=lines, faces=faces, parts=parts, fields=fields)
-    contents = [head.encode("ascii"), BEFORE_DATA, *(block.data for block in blocks), AFTER_DATA]
-    Path(path).write_bytes(b"".join(contents))
+    Path(path).write_bytes(b"".join([head.encode("ascii"), BEFORE_DATA, data, AFTER_DATA]))
 
 
 def _packed(raw: bytes, level: int = 0) -> bytes:
@@ -219,9 +209,16 @@ class Collection:
             file.write(data)
 
 
-def fibre_file(muscle: str, frame: int) -> str:
-    """Name of the file of a muscle's fibres in a frame, in the run's folder."""
-    return f"fibres/{muscle}_{frame:04d}.vtp"
+def frame_file(kind: str, name: str, frame: int) -> str:
+    """File of a mesh of some kind ("surfaces", "bones" or "fibres") in a frame, in the run's
+    folder.
+    """
+    return f"{kind}/{name}{frame_end(frame)}"
+
+
+def frame_end(frame: int) -> str:
+    """What the names of a frame's files end with."""
+    return f"_{frame:04d}.vtp"
 
 
 def write_fibres(path: Path, fibres: FibreLines) -> None:
@@ -231,12 +228,12 @@ def write_fibres(path: Path, fibres: FibreLines) -> None:
     lines, points = fibres.points.shape[:2]
     count = lines * points
     blocks = [
-        made_block("PointData", "local_stretch", fibres.local_stretch.ravel(), "Float64"),
-        made_block("CellData", "length", fibres.lengths, "Float64"),
-        made_block("CellData", "stretch", fibres.stretch, "Float64"),
-        made_block("Points", "Points", fibres.points.reshape(-1, 3), "Float64"),
-        made_block("Lines", "connectivity", np.arange(count), "Int32"),
-        made_block("Lines", "offsets", points * np.arange(1, lines + 1), "Int32"),
+        Block("PointData", "local_stretch", fibres.local_stretch.ravel()),
+        Block("CellData", "length", fibres.lengths),
+        Block("CellData", "stretch", fibres.stretch),
+        Block("Points", "Points", fibres.points.reshape(-1, 3)),
+        Block("Lines", "connectivity", np.arange(count, dtype="<i4")),
+        Block("Lines", "offsets", points * np.arange(1, lines + 1, dtype="<i4")),
     ]
     write_blocks(path, blocks, points=count, lines=lines)
 

@@ -25,7 +25,7 @@ from rbfmuscle.metrics.summary import QuantityFacts
 from rbfmuscle.run.appearance import muscle_groups, tendon_mesh
 from rbfmuscle.run.data import given_file
 from rbfmuscle.run.info import FORMAT, RunInfo, record_scene
-from rbfmuscle.run.vtk_files import Collection, fibre_file, write_fibres, write_vtp
+from rbfmuscle.run.vtk_files import Collection, frame_end, frame_file, write_fibres, write_vtp
 from rbfmuscle.scene.motion import shown_value
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
@@ -133,7 +133,7 @@ class RunWriter:
         except OSError as error:
             self._failed = True
             for name in self.folder.listed:
-                if name.endswith(f"{_frame_end(frame.index)}.vtp"):
+                if name.endswith(frame_end(frame.index)):
                     (self.directory / name).unlink(missing_ok=True)
             raise SolveError(
                 f"cannot write frame {frame.index}: {error.strerror}; "
@@ -171,8 +171,9 @@ class RunWriter:
             self._collections["surfaces"].add(step, surfaces)
         fibres = []
         for name, lines in frame.fibres.items():
-            self.folder.add(fibre_file(name, frame.index))
-            write_fibres(self.directory / fibre_file(name, frame.index), lines)
+            file = frame_file("fibres", name, frame.index)
+            self.folder.add(file)
+            write_fibres(self.directory / file, lines)
             values = zip(lines.lengths.tolist(), lines.stretch.tolist())
             fibres += [(frame.index, name, number, *row) for number, row in enumerate(values)]
         # A frame's surfaces are on the disk before its poses: readers of a run that was killed rely
@@ -196,7 +197,7 @@ class RunWriter:
             tendon = tendon_mesh(muscle, frame.tendons)
             if tendon is not None:
                 meshes[tendon_name(muscle.name)] = tendon
-        entries = [(name, f"surfaces/{name}{_frame_end(frame.index)}.vtp") for name in meshes]
+        entries = [(name, frame_file("surfaces", name, frame.index)) for name in meshes]
         self.folder.add(*(file for _, file in entries))
 
         def write(entry):
@@ -224,20 +225,20 @@ class RunWriter:
         for bone in self.scene.bones:
             name = bone.name
             mesh = bone.mesh
-            pose = frame.poses[bone.name]
+            pose = frame.poses[name]
             if name not in self._bones:
-                self._write_bone(name, np.eye(4), "", mesh.vertices, mesh.faces)
+                file = f"bones/{name}.vtp"
+                self._write_bone(name, np.eye(4), file, mesh.vertices, mesh.faces)
             if not np.array_equal(self._bones[name][0], pose):
                 if name not in self._light:
                     self._light[name] = _light_mesh(mesh.vertices, mesh.faces)
                 vertices, faces = self._light[name]
-                moved = to_world(vertices, pose)
-                end = _frame_end(frame.index)
-                self._write_bone(name, pose.copy(), end, moved.astype(np.float32), faces)
+                moved = to_world(vertices, pose).astype(np.float32)
+                file = frame_file("bones", name, frame.index)
+                self._write_bone(name, pose.copy(), file, moved, faces)
         return [(bone.name, self._bones[bone.name][1]) for bone in self.scene.bones]
 
-    def _write_bone(self, name, pose, end, vertices, faces):
-        file = f"bones/{name}{end}.vtp"
+    def _write_bone(self, name, pose, file, vertices, faces):
         self._bones[name] = pose, file
         self.folder.add(file)
         write_vtp(self.directory / file, vertices, faces, name=name)
@@ -252,11 +253,6 @@ def _light_mesh(vertices: Floats, faces: Integers) -> tuple[Floats, Integers]:
         found = {"vertices": light[0], "faces": light[1]}
         store_arrays(key, found)
     return np.asarray(found["vertices"], float), np.asarray(found["faces"], np.int64)
-
-
-def _frame_end(frame: int) -> str:
-    """What the names of a frame's files end with."""
-    return f"_{frame:04d}"
 
 
 def write_csv(path: Path, rows: Iterable[Sequence[object]], *, mode: str = "w") -> None:
