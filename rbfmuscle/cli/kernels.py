@@ -76,8 +76,7 @@ def kernels(
             jobs=work.jobs,
             progress=bar,
         )
-    facts = json.loads((output / "kernels.json").read_text(encoding="utf-8"))
-    return print_result(work, facts, _study_lines(study, output))
+    return print_result(work, study.model_dump(), _study_lines(study, output))
 
 
 def _study_lines(study, output):
@@ -109,7 +108,10 @@ def _find_wanted(meshes, output, error, kernels, units, printing):
             "units": units,
             "row": found.row.model_dump(),
             "toml": found.row.toml(),
-            "tried": [one._asdict() for one in found.tried],
+            "tried": [
+                {"kernel": row.kernel, "centres": row.centres, "error": row.error}
+                for row in found.tried
+            ],
             "said": found.describe(name, units),
         }
     with kernels_folder(output).staged() as stage:

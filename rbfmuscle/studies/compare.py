@@ -110,49 +110,33 @@ def compare(
     (['pbd', 'xpbd'], dtype('float64'))
     """
     variants = _variants(open_scene(scene), list(models), settings or {}, frames)
-    with cores_limited(jobs), study_folder(directory) as folder:
-        return _compare(variants, folder, pictures, progress).kept_in(folder, own=directory is None)
-
-
-def _compare(
-    variants: Mapping[str, Scene],
-    folder: Path,
-    pictures: bool,
-    progress: OnProgress | None,
-) -> Comparison:
-    """Run the scene of each model in a folder of its name, and write tables and a report."""
-    output = OutputFolder(folder, "compare", FILES)
-    for name in variants:
-        run_folder(folder / name)
-    output.clear()
-    output.add(*FILES)
     first = next(iter(variants.values()))
     last = len(first.motion) - 1
     poses = [int(first.motion.numbers[k]) for k in sorted({0, last // 2, last})]
-    results, failed, done, total = {}, {}, 0, len(variants) * len(first.motion)
-    for name, variant in variants.items():
-        count = part_progress(progress, done, total)
-        done += len(first.motion)
-        try:
-            with stage(name):
-                results[name] = _measure(name, variant, folder / name, count)
-        except SolveError as error:
-            failed[name] = str(error)
-    if not results:
-        raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
-    with stage("distances between models"):
-        add_distances(results, folder, poses)
-    labels = {name: model_title(variant.muscles[0]) for name, variant in variants.items()}
-    unknowns = {
-        name: {muscle.name: solved_points(muscle, variant) for muscle in variant.muscles}
-        for name, variant in variants.items()
-    }
-    table = write_tables(
-        folder, first, results, failed, labels=labels, unknowns=unknowns, poses=poses
-    )
-    with stage("drawing pictures" if pictures else "writing the report"):
-        write_page(folder, table, pictures=pictures)
-    return table
+    with cores_limited(jobs), study_folder(directory) as folder:
+        output = OutputFolder(folder, "compare", FILES)
+        for name in variants:
+            run_folder(folder / name)
+        output.clear()
+        output.add(*FILES)
+        results: dict[str, Values] = {}
+        failed: dict[str, str] = {}
+        for k, (name, variant) in enumerate(variants.items()):
+            length = len(first.motion)
+            count = part_progress(progress, k * length, len(variants) * length)
+            try:
+                with stage(name):
+                    results[name] = _measure(name, variant, folder / name, count)
+            except SolveError as error:
+                failed[name] = str(error)
+        if not results:
+            raise SolveError("; ".join(f"{name}: {reason}" for name, reason in failed.items()))
+        with stage("distances between models"):
+            add_distances(results, folder, poses)
+        table = write_tables(folder, variants, results, failed, poses)
+        with stage("drawing pictures" if pictures else "writing the report"):
+            write_page(folder, table, pictures=pictures)
+        return table.kept_in(folder, own=directory is None)
 
 
 def _variants(scene, models, settings, frames):
@@ -477,19 +461,19 @@ def _apart(first: RunData, other: RunData, muscle: str, quantity: str, about: st
 
 def write_tables(
     folder: Path,
-    scene: Scene,
+    variants: Mapping[str, Scene],
     results: dict[str, Values],
     failed: dict[str, str],
-    *,
-    labels: dict[str, str],
-    unknowns: dict[str, dict[str, str]],
     poses: list[int],
 ) -> Comparison:
     """Write ``comparison.json``, which is returned, ``comparison.csv``: values by model, muscle and
     quantity, and ``statistics.csv``: their means and standard deviations over the frames.
 
-    ``unknowns`` are the points that each model solves for, in words, by model and muscle.
+    ``variants`` are the scene of each model, ``poses`` the numbers of the frames at which distances
+    were measured.
     """
+    scene = next(iter(variants.values()))
+    labels = {name: model_title(variants[name].muscles[0]) for name in results}
     runs = {name: RunData.load(folder / name) for name in results}
     beyond = {name: muscles_beyond(run) for name, run in runs.items()}
     table = Comparison(
@@ -499,11 +483,14 @@ def write_tables(
         frames=len(scene.motion),
         poses=poses,
         models=list(results),
-        labels={name: labels[name] for name in results},
+        labels=labels,
         failed=failed,
         answer=describe(results, labels, scene.units, beyond),
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
-        unknowns={name: unknowns[name] for name in results},
+        unknowns={
+            name: {m.name: solved_points(m, variants[name]) for m in variants[name].muscles}
+            for name in results
+        },
         measures={
             name: MeasureFacts(
                 unit=unit_text(m.kind, scene.units),
@@ -702,15 +689,6 @@ def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> Non
     SolveError.
     """
     runs = {found.labels[name]: RunData.load(folder / name) for name in found.models}
-    page = _page(found, runs)
-    if pictures:
-        page.scene = packed_scene(runs)
-    else:
-        page.missing = "No pictures: they were switched off."
-    page.write(folder / "report.html")
-
-
-def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
     first = next(iter(runs.values()))
     failed = [f"{name} did not finish: {reason}" for name, reason in found.failed.items()]
     counts = {"muscles": len(first.muscles), "frames": found.frames, **found.machine}
@@ -722,11 +700,13 @@ def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
         [Cell(muscle), *(Cell(found.unknowns[name][muscle]) for name in models)]
         for muscle in found.unknowns[models[0]]
     ]
-    return ReportPage(
+    ReportPage(
         f"{found.scene}: models compared",
         [f"{counts[what]} {what}" for what in ("muscles", "frames", "threads")],
         " ".join([found.answer, *failed]),
         BAD if failed else PLAIN,
+        scene=packed_scene(runs) if pictures else "",
+        missing="" if pictures else "No pictures: they were switched off.",
         lights=[_light(found, name, limits.get(name)) for name in LIGHTS if _values(found, name)],
         heads=list(runs),
         sections=[
@@ -744,7 +724,7 @@ def _page(found: Comparison, runs: Mapping[str, RunData]) -> ReportPage:
             Section("How to read this", text=_READING, terms=terms),
         ],
         footer=", ".join(f"{name} {value}" for name, value in found.versions.items()),
-    )
+    ).write(folder / "report.html")
 
 
 def _values(found: Comparison, quantity: str) -> list[float | None]:

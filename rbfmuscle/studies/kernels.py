@@ -12,7 +12,7 @@ import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from itertools import cycle
@@ -35,7 +35,7 @@ from rbfmuscle.display.page import (
 )
 from rbfmuscle.display.plots import Point, Track, front_plot, line_plot
 from rbfmuscle.folders import OutputFolder
-from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike
+from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike, unit
 from rbfmuscle.geometry.frames import principal_axes
 from rbfmuscle.geometry.mesh_distance import MeshDistance
 from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
@@ -130,11 +130,10 @@ def study_kernels(
         date=datetime.date.today().isoformat(),
         meshes={name: mesh_hash(points, faces) for name, (points, faces, _) in checked.items()},
     )
-    done = 0
     with cores_limited(jobs), study_folder(directory) as folder:
-        for name, (vertices, faces, chosen) in checked.items():
+        for k, (name, (vertices, faces, chosen)) in enumerate(checked.items()):
             fits = len(chosen) * len(centres)
-            count = part_progress(progress, done, len(meshes) * fits)
+            count = part_progress(progress, k * fits, len(meshes) * fits)
             judge = ReferenceSurface(vertices, faces, resolution)
             with stage(name):
                 found = measure_fits(judge, chosen, centres, count)
@@ -142,10 +141,9 @@ def study_kernels(
                 one.row.surface = name
             study.rows += [one.row for one in found]
             study.surfaces += [one.surface for one in found]
-            done += fits
         with kernels_folder(folder).staged() as staged:
-            table = [[getattr(row, name) for name in _columns()] for row in study.rows]
-            write_csv(staged / "kernels.csv", [_columns(), *table])
+            table = [[getattr(row, name) for name in CSV_COLUMNS] for row in study.rows]
+            write_csv(staged / "kernels.csv", [CSV_COLUMNS, *table])
             text = json_text(study.model_dump())
             (staged / "kernels.json").write_text(text, encoding="utf-8")
             write_page(staged, study)
@@ -227,13 +225,21 @@ class KernelRow(BaseModel):
 
     def toml(self) -> str:
         """The lines of a scene file's model table that give the row."""
-        lines = ["[muscle.model]", 'name = "rbf"', f'kernel = "{self.kernel}"']
-        lines.append(f"centres = {self.centres}")
+        lines = [
+            "[muscle.model]",
+            'name = "rbf"',
+            f'kernel = "{self.kernel}"',
+            f"centres = {self.centres}",
+        ]
         if self.epsilon:
             lines.append(f"epsilon = {self.epsilon:.6g}")
         if self.bound:
             lines.append(f"condition = {self.bound:g}")
         return "\n".join(lines)
+
+
+# Columns of ``kernels.csv``.
+CSV_COLUMNS = [name for name in KernelRow.model_fields if name != "trials"]
 
 
 def at_end(shape: float) -> bool:
@@ -324,8 +330,7 @@ class ReferenceSurface:
         )
         self.distance = MeshDistance(vertices, faces)
         self.points, which = spread_points(vertices, faces, JUDGES)
-        normal = face_normals(vertices, faces)[which]
-        self.normals = normal / np.linalg.norm(normal, axis=1)[:, None]
+        self.normals = unit(face_normals(vertices, faces)[which])
         self.held_out = spread_points(vertices, faces, HELD_OUT, seed=1)[0]
 
     def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float]:
@@ -357,41 +362,33 @@ class Measured(NamedTuple):
 
 def measure_row(judge: ReferenceSurface, sample: SurfaceSample, kernel: Kernel) -> Measured:
     """One row of the table, its times left open, and its surface."""
+    points = sample.points
+    normals = sample.normals
     fit = FieldFit(kernel, 1.0, BOUND if kernel.has_epsilon else np.inf)
     note = "" if kernel.hermite else "values on and off the surface, the kernel is not C2"
-    row = KernelRow(kernel=kernel.name, centres=len(sample.points), note=note)
+    row = KernelRow(kernel=kernel.name, centres=len(points), note=note)
     surface = None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NumericalWarning)
         try:
-            fit = _chosen_fit(row, judge, sample, fit)
-            surface = _measure(row, judge, sample, fit.fit(sample.points, sample.normals))
+            # The epsilon of the least error, or a bounded condition where one is needed.
+            if kernel.has_epsilon:
+                choice = choose_epsilon(
+                    points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
+                )
+                row.trials = [(shape, error) for shape, error in choice.trials.tolist()]
+                row.epsilon = choice.epsilon
+                row.shape = choice.epsilon * float(spacing(points).mean())
+                if choice.broken:
+                    raise ValueError(choice.broken)
+                fit = replace(fit, epsilon=choice.epsilon)
+            elif fit.fit(points, normals).condition > BOUND:
+                row.bound = BOUND
+                fit = replace(fit, condition=BOUND)
+            surface = _measure(row, judge, sample, fit.fit(points, normals))
         except (ValueError, np.linalg.LinAlgError) as error:
             row.unfit = " ".join(str(error).split())
     return Measured(row, sample, fit, surface)
-
-
-def _chosen_fit(
-    row: KernelRow, judge: ReferenceSurface, sample: SurfaceSample, fit: FieldFit
-) -> FieldFit:
-    """The fit with the epsilon of the least error, or with a bounded condition where it needs one;
-    both are written into the row.
-    """
-    points, normals = sample.points, sample.normals
-    if fit.kernel.has_epsilon:
-        choice = choose_epsilon(
-            points, normals, fit, held_out=judge.held_out, distance=judge.distance.unsigned
-        )
-        row.trials = [(shape, error) for shape, error in choice.trials.tolist()]
-        row.epsilon = choice.epsilon
-        row.shape = choice.epsilon * float(spacing(points).mean())
-        if choice.broken:
-            raise ValueError(choice.broken)
-        return replace(fit, epsilon=choice.epsilon)
-    if fit.fit(points, normals).condition > BOUND:
-        row.bound = BOUND
-        return replace(fit, condition=BOUND)
-    return fit
 
 
 def _measure(
@@ -428,7 +425,7 @@ def time_row(found: Measured, points: Floats) -> None:
     """
     row = found.row
     sample = found.sample
-    parts = overlapping_parts(found.sample.points)
+    parts = overlapping_parts(sample.points)
     with warnings.catch_warnings(), threads_limited(1):
         warnings.simplefilter("ignore", NumericalWarning)  # it stands in the row's condition
         field = found.fit.fit(sample.points, sample.normals, parts)
@@ -474,18 +471,21 @@ class KernelStudy(BaseModel, Study):
         """The rows of each surface."""
         return {name: [row for row in self.rows if row.surface == name] for name in self.meshes}
 
+    def best(self) -> dict[str, KernelRow | None]:
+        """What `recommend` gives of the rows of each surface."""
+        return {name: recommend(rows) for name, rows in self.by_surface.items()}
+
     @property
     def recommended(self) -> KernelRow | None:
         """The quickest row that errs at most 5 % more than the best, None where every one is unfit;
         of several surfaces that of the first for which it is the kernel that serves most.
         """
         kernel = self._kernel()[0]
-        best = (recommend(rows) for rows in self.by_surface.values())
-        return next((row for row in best if row is not None and row.kernel == kernel), None)
+        return next((row for row in self.best().values() if row and row.kernel == kernel), None)
 
     def table(self) -> np.ndarray:
         """The rows as a structured ndarray, with the columns of ``kernels.csv``."""
-        columns = {name: [getattr(row, name) for row in self.rows] for name in _columns()}
+        columns = {name: [getattr(row, name) for row in self.rows] for name in CSV_COLUMNS}
         return as_table(
             {
                 name: np.array([np.nan if value is None else value for value in values])
@@ -515,8 +515,7 @@ class KernelStudy(BaseModel, Study):
         for rows in self.by_surface.values():
             good = [row for row in rows if not row.unfit]
             tied.update({row.kernel for row in good if row.error <= ALIKE * good[0].error})
-        best = (recommend(rows) for rows in self.by_surface.values())
-        chosen = Counter(row.kernel for row in best if row)
+        chosen = Counter(row.kernel for row in self.best().values() if row)
         kernel = max(chosen, key=lambda name: (tied[name], chosen[name]), default="")
         return kernel, tied[kernel], chosen[kernel]
 
@@ -534,7 +533,22 @@ def measure_fits(
     for count in counts:
         sample = sample_surface(judge.vertices, judge.faces, int(count), placement="greedy")
         calls += [(sample, kernel) for kernel in kernels]
-    found = _measure_all(judge, calls, progress)
+    lock = threading.Lock()
+    done = 0
+
+    def measure(call: tuple[SurfaceSample, Kernel]) -> Measured:
+        nonlocal done
+        one = measure_row(judge, *call)
+        with lock:
+            done += 1
+            if progress is not None:
+                progress(done, len(calls))
+        return one
+
+    # Filters of warnings belong to all threads: what each row sets is undone here.
+    with warnings.catch_warnings(), blas_limited(1):
+        warnings.simplefilter("ignore", NumericalWarning)
+        found = each(measure, calls)
     _refuse_coarse([one.row for one in found])
     for one in found:  # when nothing else runs
         if not one.row.unfit:
@@ -548,28 +562,6 @@ def measure_fits(
     for row in rows:  # no other row beats those of the front both in error and in time
         row.front = any(row is good[index] for index in front)
     return found
-
-
-def _measure_all(
-    judge: ReferenceSurface,
-    calls: list[tuple[SurfaceSample, Kernel]],
-    progress: OnProgress | None,
-) -> list[Measured]:
-    """What the rows of calls found, in their order, measured side by side on threads."""
-    lock, done = threading.Lock(), []
-
-    def measure(call: tuple[SurfaceSample, Kernel]) -> Measured:
-        found = measure_row(judge, *call)
-        with lock:
-            done.append(found)
-            if progress is not None:
-                progress(len(done), len(calls))
-        return found
-
-    # Filters of warnings belong to all threads: what each row sets is undone here.
-    with warnings.catch_warnings(), blas_limited(1):
-        warnings.simplefilter("ignore", NumericalWarning)
-        return each(measure, calls)
 
 
 def _refuse_coarse(rows: list[KernelRow]) -> None:
@@ -590,27 +582,20 @@ FEWEST, MOST = 20, GREEDY_LARGEST
 STEP, POWER = 0.04, 1.4
 
 
-class TriedFit(NamedTuple):
-    """A kernel with a number of centres, and its error [length], infinite where it is unfit."""
-
-    kernel: str
-    centres: int
-    error: float
-
-
 @dataclass
 class CentreSearchResult:
     """What `reach_error` found.
 
     ``row`` is as in `KernelStudy.rows`: the one that reached the ``wanted`` error, else that of the
-    smallest error; ``error`` is its [length]; ``tried`` is all that was measured, in order.
+    smallest error; ``error`` is its [length]; ``tried`` are the rows of all that was measured, in
+    order.
     """
 
     reached: bool
     row: KernelRow
     error: float
     wanted: float
-    tried: list[TriedFit] = field(default_factory=list)
+    tried: list[KernelRow] = field(default_factory=list)
 
     def describe(self, name: str, units: str = "") -> str:
         """One line on the surface of this name: what reaches the wanted error, or what the best
@@ -665,71 +650,57 @@ def reach_error(
     if not 0.0 < error < np.inf:
         raise UsageError(f"error must be a positive length, got {error}")
     vertices, faces, named = check_request(mesh, kernels or CANDIDATES)
-    search = _Search(ReferenceSurface(vertices, faces), float(error), progress)
-    for kernel in named:
-        search.try_kernel(kernel)
-    return search.result()
+    wanted = float(error)
+    judge = ReferenceSurface(vertices, faces)
+    sample = cache(partial(sample_surface, vertices, faces, placement="greedy"))
+    found: dict[tuple[str, int], Measured] = {}
 
-
-class _Search:
-    """Rows by kernel and number of centres, and the best so far."""
-
-    def __init__(
-        self,
-        judge: ReferenceSurface,
-        error: float,
-        progress: OnProgress | None,
-    ) -> None:
-        self.judge = judge
-        self.error = error
-        self.progress = progress
-        self.sample = cache(
-            partial(sample_surface, judge.vertices, judge.faces, placement="greedy")
-        )
-        self.found: dict[tuple[str, int], Measured] = {}
-        self.best: tuple[str, int] | None = None
-
-    def measure(self, kernel: Kernel, count: int) -> float:
-        """Error of a kernel with so many centres [length], infinite where it broke."""
+    def measure(kernel: Kernel, count: int) -> float:
         key = kernel.name, count
-        if key not in self.found:
-            self.found[key] = measure_row(self.judge, self.sample(count), kernel)
-            if self.progress is not None:
-                self.progress(len(self.found), max(len(self.found) + 1, 8))
-        error = self.found[key].row.error
-        if error <= self.error and (self.best is None or count < self.best[1]):
-            self.best = key
-        return error
+        if key not in found:
+            found[key] = measure_row(judge, sample(count), kernel)
+            if progress is not None:
+                progress(len(found), max(len(found) + 1, 8))
+        return found[key].row.error
 
-    def try_kernel(self, kernel: Kernel) -> None:
-        """The fewest centres of a kernel, where it may need fewer than the best so far."""
-        low, high = FEWEST - 1, MOST + 1
-        if self.best is not None:  # only what serves with fewer than the best is worth more fits
-            high = int((1.0 - STEP) * self.best[1])
-            if high < FEWEST or self.measure(kernel, high) > self.error:
-                return
-        count = min(120, high - 1)
-        while high > low + max(1, STEP * low):
-            missed = self.measure(kernel, count)
-            low, high = (low, count) if missed <= self.error else (count, high)
-            if low >= FEWEST and high <= MOST:
-                count = round(math.sqrt(low * high))
-            else:  # by the power law, while one end is open
-                factor = (missed / self.error) ** (1.0 / POWER) if math.isfinite(missed) else 2.0
-                beyond = 0.9 if missed <= self.error else 1.1
-                count = round(count * float(np.clip(factor, 0.4, 2.5)) * beyond)
-            count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
+    best: tuple[str, int] | None = None
+    for kernel in named:
+        _search_centres(partial(measure, kernel), wanted, None if best is None else best[1])
+        reached = [key for key, one in found.items() if one.row.error <= wanted]
+        best = min(reached, key=lambda key: key[1], default=None)
+    chosen = found[best or min(found, key=lambda key: found[key].row.error)]
+    if not chosen.row.unfit:
+        time_row(chosen, judge.points)
+    return CentreSearchResult(
+        best is not None,
+        chosen.row,
+        chosen.row.error,
+        wanted,
+        [one.row for one in found.values()],
+    )
 
-    def result(self) -> CentreSearchResult:
-        """The row of fewest centres that reaches the error, or that of the smallest error."""
-        least = min(self.found, key=lambda key: self.found[key].row.error)
-        found = self.found[self.best or least]
-        if not found.row.unfit:
-            time_row(found, self.judge.points)
-        tried = [TriedFit(*key, one.row.error) for key, one in self.found.items()]
-        return CentreSearchResult(
-            self.best is not None, found.row, found.row.error, self.error, tried
-        )
+
+def _search_centres(measure: Callable[[int], float], wanted: float, best: int | None) -> None:
+    """Measure the errors of a kernel with numbers of centres until the fewest that meet a wanted
+    one is among these, where it may need fewer than the ``best`` so far; errors are infinite where
+    fits broke.
+    """
+    low, high = FEWEST - 1, MOST + 1
+    if best is not None:  # only what serves with fewer than the best is worth more fits
+        high = int((1.0 - STEP) * best)
+        if high < FEWEST or measure(high) > wanted:
+            return
+    count = min(120, high - 1)
+    while high > low + max(1, STEP * low):
+        missed = measure(count)
+        low, high = (low, count) if missed <= wanted else (count, high)
+        if low >= FEWEST and high <= MOST:
+            count = round(math.sqrt(low * high))
+        else:  # by the power law, while one end is open
+            factor = (missed / wanted) ** (1.0 / POWER) if math.isfinite(missed) else 2.0
+            beyond = 0.9 if missed <= wanted else 1.1
+            count = round(count * float(np.clip(factor, 0.4, 2.5)) * beyond)
+        count = int(np.clip(count, low + 1, high - 1)) if high > low + 1 else high
 
 
 # Quantity: heading, factor.
@@ -760,18 +731,13 @@ def kernels_folder(directory: str | Path) -> OutputFolder:
     return OutputFolder(directory, "kernels", (*FILES, "error.json"))
 
 
-def _columns() -> list[str]:
-    """Columns of ``kernels.csv``."""
-    return [name for name in KernelRow.model_fields if name != "trials"]
-
-
 def write_page(directory: Path, study: KernelStudy) -> None:
     """Write ``kernels.html`` of what ``kernels.json`` holds."""
     surfaces, units = study.by_surface, study.units
     several = len(surfaces) > 1
     title = f"all {len(surfaces)} muscles" if several else next(iter(surfaces)).replace("_", " ")
     counts = ", ".join(map(str, sorted({row.centres for row in study.rows})))
-    best = {name: recommend(rows) for name, rows in surfaces.items()}
+    best = study.best()
     code = "\n\n".join(f"# {name}\n{row.toml()}" for name, row in best.items() if row)
     hint = f"distances in {units or 'mesh units'}"
     ReportPage(
@@ -784,8 +750,8 @@ def write_page(directory: Path, study: KernelStudy) -> None:
         ],
         study.answer(),
         GOOD if any(best.values()) else BAD,
-        plot=_plot(surfaces, units),
-        lights=_lights(surfaces, units),
+        plot=_plot(study),
+        lights=_lights(study),
         heads=["RMS error", "fit and 20,000 values"],
         sections=[
             *(
@@ -812,54 +778,57 @@ def write_page(directory: Path, study: KernelStudy) -> None:
     ).write(directory / "kernels.html")
 
 
-def _lights(surfaces: Mapping[str, Sequence[KernelRow]], units: str) -> list[CheckRow]:
+def _lights(study: KernelStudy) -> list[CheckRow]:
     """Of one surface its best rows, each with whether it ties; of several what is recommended for
     each.
     """
-    best = {name: recommend(rows) for name, rows in surfaces.items()}
-    chosen = [(name, row, GOOD) for name, row in best.items() if row is not None]
-    if len(surfaces) == 1:
-        ((name, rows),) = surfaces.items()
-        good = [row for row in rows if not row.unfit]
-        chosen = [("recommended", row, GOOD) for _, row, _ in chosen]
-        chosen += [
+    chosen = [(name, row, GOOD) for name, row in study.best().items() if row is not None]
+    if len(study.meshes) == 1 and chosen:
+        ((_, best, _),) = chosen
+        good = [row for row in study.rows if not row.unfit]
+        others = [
             ("", row, GOOD if row.error <= ALIKE * good[0].error else PLAIN)
             for row in good
-            if row is not best[name]
+            if row is not best
         ]
-        chosen = chosen[:_MOST_LIGHTS]
-    cells = [[number_cell(row.rms, units, s), number_cell(row.cost, "s")] for _, row, s in chosen]
-    return [CheckRow(row.title, pair, note=note) for (note, row, _), pair in zip(chosen, cells)]
+        chosen = [("recommended", best, GOOD), *others][:_MOST_LIGHTS]
+    return [
+        CheckRow(
+            row.title,
+            [number_cell(row.rms, study.units, state), number_cell(row.cost, "s")],
+            note=note,
+        )
+        for note, row, state in chosen
+    ]
 
 
-def _plot(surfaces: Mapping[str, Sequence[KernelRow]], units: str) -> str:
+def _plot(study: KernelStudy) -> str:
     """Error against the time of a fit and 20,000 values: a colour a surface, or of one a number of
     centres.
     """
     points = []
-    for name, rows in surfaces.items():
-        best = recommend(rows)
-        for row in rows:
-            if not row.unfit:
-                group = name if len(surfaces) > 1 else f"{row.centres} centres"
-                place = 1e3 * row.cost, row.error, row.kernel, group
-                points.append(Point(*place, row is best, row.front))
-    labels = ("a fit and 20,000 values [ms of one thread]", f"RMS error [{units or 'mesh units'}]")
-    return front_plot(points, labels)
+    best = study.best()
+    for row in study.rows:
+        if not row.unfit:
+            group = row.surface if len(study.meshes) > 1 else f"{row.centres} centres"
+            place = 1e3 * row.cost, row.error, row.kernel, group
+            points.append(Point(*place, row is best[row.surface], row.front))
+    unit = study.units or "mesh units"
+    return front_plot(points, ("a fit and 20,000 values [ms of one thread]", f"RMS error [{unit}]"))
 
 
 def _curves(rows: Sequence[KernelRow], units: str) -> list[str]:
     """For each number of centres the error at the held-out points against epsilon, by kernel."""
     pictures = []
-    unit = units or "mesh units"
     for count in dict.fromkeys(row.centres for row in rows):
         tried = [row for row in rows if row.centres == count and row.trials]
         tracks = []
         for row, colour in zip(tried, cycle(MUSCLE_COLOURS)):
             shapes, errors = np.array(row.trials).T
             tracks.append(Track(row.kernel, colour, np.log10(shapes), np.log10(errors)))
-        labels = "log10 of epsilon times spacing", f"log10 of the RMS error [{unit}]"
+        error = f"log10 of the RMS error [{units or 'mesh units'}]"
         if tracks:
+            labels = "log10 of epsilon times spacing", error
             pictures.append(line_plot(f"{count} centres", tracks, labels, legend=True))
     return pictures
 

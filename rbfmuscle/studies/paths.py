@@ -87,18 +87,15 @@ def sample_muscles(
     groups = _groups(scene, held)
     ranges = _ranges(scene, {name: None for names in groups for name in names}, given)
     counts = {names: samples or FOR_EACH * len(names) for names in groups}
+    known = all_coordinates(scene.joints)
     done = 0
     for names, muscles in groups.items():
         part = scene.with_options()
         part.muscles = muscles
-        values = _poses([ranges[name] for name in names], counts[names])
         box = {name: ranges[name] for name in names}
-        known = all_coordinates(scene.joints)
-        order = _tour(
-            values,
-            np.array([known[name].rest for name in names]),
-            np.ptp(list(box.values()), axis=1),
-        )
+        values = _poses(list(box.values()), counts[names])
+        rest = np.array([known[name].rest for name in names])
+        order = _tour(values, rest, np.ptp(list(box.values()), axis=1))
         poses = [{**held, **dict(zip(names, values[k].tolist()))} for k in order]
         part.motion = Motion(poses)
         models = build_models(part)
@@ -106,7 +103,7 @@ def sample_muscles(
         rows = {}
         try:
             fields = build_fields(part, _reached(part, poses, box))
-            for place, row in zip(order, _measured(part, models, gauges, poses, names, fields)):
+            for place, row in zip(order, _measured(part, gauges, poses, names, fields)):
                 rows[place] = row
                 done += 1
                 if progress is not None:
@@ -129,6 +126,7 @@ class _Gauges:
 
     def __init__(self, scene, models):
         self.scene = scene
+        self.models = models
         self.bundles = build_bundles(scene, models)
         self.lines = {
             model.name: Centreline(scene.muscle(model.name), scene.joints, *model.material_mesh())
@@ -137,17 +135,18 @@ class _Gauges:
         self.names = []
         self.counts = []  # gauges of each model
         for model in models:
-            fibres = self.bundles.get(model.name)
-            count = 0 if fibres is None else len(fibres.rest)
-            names = [f"{model.name}_{k + 1}" for k in range(count)] or [model.name]
+            names = [model.name]
+            if model.name in self.bundles:
+                count = len(self.bundles[model.name].rest)
+                names = [f"{model.name}_{k + 1}" for k in range(count)]
             self.names += names
             self.counts.append(len(names))
 
-    def lengths(self, models, here):
+    def lengths(self, here):
         """Lengths (n,) where the models are now, at coordinates."""
         poses = bone_poses(self.scene, here)
         found = []
-        for model in models:
+        for model in self.models:
             if model.name in self.bundles:
                 for end in self.scene.muscle(model.name).tendons:
                     poses[end.name]  # its tendon is found when it is first asked for
@@ -176,21 +175,21 @@ def _reached(scene, poses, ranges):
     return regions
 
 
-def _measured(scene, models, gauges, poses, names, fields):
+def _measured(scene, gauges, poses, names, fields):
     """For each pose and gauge: length, arm about each coordinate of ``names``, whether it did not
     settle.
 
     A pose is reached from the one before. Where that fails, from rest; where that fails too, it has
     no values.
     """
-    rest = [model.snapshot() for model in models]
+    rest = [model.snapshot() for model in gauges.models]
     loop = None
     for pose in poses:
         row = None if loop is None else _row(loop, gauges, pose, names)
         if row is None:
-            for model, state in zip(models, rest):
+            for model, state in zip(gauges.models, rest):
                 model.restore(state)
-            loop = FrameLoop(scene, models, bone_sdfs=fields, surfaces=False)
+            loop = FrameLoop(scene, gauges.models, bone_sdfs=fields, surfaces=False)
             loop.activations.target = loop.activations.at(0)  # the same in all solves
             row = _row(loop, gauges, pose, names)
         if row is None:
@@ -227,7 +226,7 @@ def _settled(loop, gauges, pose):
     loop.skip(pose)
     with loop.working():
         each(lambda group: _settle(group, loop.here), loop.groups)
-    return gauges.lengths([stepper.model for stepper in loop.steppers], loop.here)
+    return gauges.lengths(loop.here)
 
 
 def _settle(group, here):
@@ -368,9 +367,7 @@ def report_fits(
     unit = scene.units
     turning = {name: f.motion != "translation" for name, f in all_coordinates(scene.joints).items()}
     for found in sampled:
-        radian = [
-            1.0 if turning[name] else from_mm(SHIFT, scene.units) for name in found.coordinates
-        ]
+        radian = [1.0 if turning[name] else from_mm(SHIFT, unit) for name in found.coordinates]
         path, row = _fit(found, np.array(radian))
         fitted.append(path)
         errors.append(row)
@@ -384,16 +381,13 @@ def report_fits(
             + (f"; at {found.unsettled} poses it did not settle" if found.unsettled else "")
         )
     with paths_folder(directory).staged() as stage:
-        write_paths(
-            stage / "paths.xml", fitted, from_mm(1000.0, scene.units), turning, targets or {}
-        )
-        rows = [list(errors[0]), *(list(row.values()) for row in errors)]
-        write_csv(stage / "errors.csv", rows)
-    file = directory / "paths.xml"
-    return errors, [
-        *lines,
-        f"{file}: {len(fitted)} paths; OpenSim puts them in by their names, /forceset/MUSCLE",
-    ]
+        write_paths(stage / "paths.xml", fitted, from_mm(1000.0, unit), turning, targets or {})
+        write_csv(stage / "errors.csv", [list(errors[0]), *(list(row.values()) for row in errors)])
+    lines.append(
+        f"{directory / 'paths.xml'}: {len(fitted)} paths; OpenSim puts them in by their names, "
+        "/forceset/MUSCLE"
+    )
+    return errors, lines
 
 
 def _fit(found, radian):
@@ -406,10 +400,15 @@ def _fit(found, radian):
             f"muscle {found.muscle!r}: {failed} of {count} poses failed, too few are left to fit"
         )
     parts = (found.values[use], found.lengths[use], found.arms[use])
-    path = fit_path(found.muscle, found.coordinates, *parts, radian=radian, most=HIGHEST_ORDER)
-    row = {"muscle": path.muscle, "order": path.order, "fitted": int(use.sum()), "failed": failed}
-    row["held_out"] = int(out.sum())
-    row["unsettled"] = found.unsettled
+    path = fit_path(found.muscle, found.coordinates, *parts, radian=radian)
+    row = {
+        "muscle": path.muscle,
+        "order": path.order,
+        "fitted": int(use.sum()),
+        "failed": failed,
+        "held_out": int(out.sum()),
+        "unsettled": found.unsettled,
+    }
     length = path.length(found.values[out]) - found.lengths[out]
     arm = radian * (path.arms(found.values[out]) - found.arms[out])
     for name, error in {"length": length, "arm": arm}.items():
@@ -453,8 +452,7 @@ def _rows(values, order):
     powers = exponents(values.shape[1], order)
     rows = [np.prod(values[:, None, :] ** powers, axis=2)]
     for axis in range(values.shape[1]):
-        lower = powers.copy()
-        lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
+        lower = np.maximum(powers - np.eye(values.shape[1], dtype=int)[axis], 0)
         rows.append(-powers[:, axis] * np.prod(values[:, None, :] ** lower, axis=2))
     return np.array(rows)
 
@@ -467,20 +465,19 @@ def fit_path(
     arms: np.ndarray,
     *,
     radian: np.ndarray | None = None,
-    most: int = 7,
 ) -> FittedPath:
     """Fit a polynomial to lengths (n,) and, by its derivatives, to moment arms (n, d).
 
     ``values`` (n, d) are the coordinates [radian or scene unit], of which ``radian`` (d,), 1 by
-    default, weighs as much as one radian, whatever the scene's unit. The order, at most ``most``,
-    is the one whose fit without a fifth of the poses, each in turn, errs least there; there are
-    always more equations than terms.
+    default, weighs as much as one radian, whatever the scene's unit. The order, at most
+    `HIGHEST_ORDER`, is the one whose fit without a fifth of the poses, each in turn, errs least
+    there; there are always more equations than terms.
     """
     count, dimension = values.shape
     weights = np.r_[1.0, ARM_WEIGHT * (np.ones(dimension) if radian is None else radian)][:, None]
     wanted = weights * np.vstack([lengths, arms.T])
     group, best = np.arange(count) % FOLDS, (np.inf, 1, np.empty(0))
-    for order in range(1, most + 1):
+    for order in range(1, HIGHEST_ORDER + 1):
         if order > 1 and 1.5 * len(exponents(dimension, order)) > 0.8 * count * (1 + dimension):
             break
         rows = weights[:, :, None] * _rows(values, order)

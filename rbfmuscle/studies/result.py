@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar, Self
 
-import numpy as np
-
 from rbfmuscle.folders import OutputFolder, copy_listed
 
 OnProgress = Callable[[int, int], None]  # of what is done and the total
@@ -19,17 +17,14 @@ OnProgress = Callable[[int, int], None]  # of what is done and the total
 class Study:
     """What a study found. Its files are in the folder that the caller gave; where none was given
     they go when what was returned is not used any more.
+
+    The ``table()`` of each kind of study gives its rows as a structured ndarray, which
+    ``pandas.DataFrame`` takes as it is.
     """
 
     command: ClassVar[str]
     page: ClassVar[str]
     _folder: Path
-
-    def table(self) -> np.ndarray:
-        """Return the rows of the study as a structured ndarray, which ``pandas.DataFrame`` takes as
-        it is.
-        """
-        raise NotImplementedError
 
     def save(self, directory: str | Path) -> None:
         """Write what the command of the study writes, its page among it.

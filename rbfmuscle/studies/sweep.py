@@ -214,18 +214,20 @@ def plan_sweep(
     the greatest number of centres, samples, nodes, iterations and cells in it and the least angle
     and step.
     """
+    wanted: list[tuple[str, dict[str, object]]] = [("default", {})]
+    wanted += [("", dict(zip(grid, chosen))) for chosen in itertools.product(*grid.values())]
+    if grid:
+        wanted.insert(0, ("reference", _finest(grid) | dict(reference or {})))
     points: list[SweepPoint] = []
     for name, scene in scenes.items():
         content = scene_content(scene, frames)
         found: dict[str, SweepPoint] = {}
         target = ""
-        if grid:
-            finest = _model_first(_finest(grid) | dict(reference or {}))
-            target = point_key(content, finest)
-            found[target] = SweepPoint(target, name, finest, "reference", target)
-        for number, chosen in enumerate([(), *itertools.product(*grid.values())]):
-            settings = _model_first(dict(zip(grid, chosen)))
-            key, role = point_key(content, settings), "" if number else "default"
+        for role, chosen in wanted:
+            # The model comes first, as choosing another one drops its options.
+            settings = dict(sorted(chosen.items(), key=lambda item: item[0] != "model"))
+            key = content_hash(content, settings)[:16]
+            target = key if role == "reference" else target
             found.setdefault(key, SweepPoint(key, name, settings, role, target))
         points += found.values()
     return points
@@ -237,19 +239,9 @@ def _finest(grid):
     return up | {key: min(values) for key, values in grid.items() if key in FINER_DOWN}
 
 
-def _model_first(settings):
-    """As choosing another model drops its options."""
-    return dict(sorted(settings.items(), key=lambda item: item[0] != "model"))
-
-
 def scene_content(scene: Scene, frames: slice | str | None = None) -> str:
     """Hash of what a scene would simulate, wherever its files lie, and of the library's version."""
     return content_hash(scene, str(frames or ""), versions()["rbfmuscle"])
-
-
-def point_key(content: str, settings: Mapping[str, object]) -> str:
-    """Key of a point: 16 hexadecimal digits."""
-    return content_hash(content, settings)[:16]
 
 
 class SweepRow(BaseModel):
@@ -678,17 +670,15 @@ def sweep_rows(
     points: Sequence[SweepPoint], folder: SweepFolder, units: Mapping[str, str]
 ) -> list[SweepRow]:
     """The rows of points; ``units`` are those of the scenes by name."""
-    rows = []
-    for point in points:
-        result = folder.read(point.key)
-        values = result.get("values", {})
-        row = SweepRow(
+    results = [folder.read(point.key) for point in points]
+    return [
+        SweepRow(
             scene=point.scene,
             units=units[point.scene],
             role=point.role,
             status=result.get("status", "missing"),
             settings=point.settings,
-            values={name: value for name, value in values.items() if value is not None},
+            values={k: v for k, v in result.get("values", {}).items() if v is not None},
             seconds=result.get("seconds"),
             threads=result.get("threads"),
             machine=result.get("machine", ""),
@@ -697,8 +687,8 @@ def sweep_rows(
             reference=point.reference,
             key=point.key,
         )
-        rows.append(row)
-    return rows
+        for point, result in zip(points, results)
+    ]
 
 
 def write_table(
@@ -833,16 +823,18 @@ def _lights(rows: list[SweepRow], verdicts: list[FrontVerdict], quantity: str) -
             ("the most accurate", front[-1].key, PLAIN),
         ]
     by_key = {row.key: row for row in rows}
-    return [_light(by_key[key], title, quantity, state) for title, key, state in chosen if key]
-
-
-def _light(row: SweepRow, title: str, quantity: str, state: str) -> CheckRow:
-    unit = row.units if quantity in LENGTHS else ""
-    cells = [
-        number_cell(row.value(quantity), unit, state),
-        number_cell(row.value("time_frame"), "s"),
-    ]
-    return CheckRow(title, cells, note="" if row.role == "default" else _short(row))
+    lights = []
+    for title, key, state in chosen:
+        if key:
+            row = by_key[key]
+            unit = row.units if quantity in LENGTHS else ""
+            cells = [
+                number_cell(row.value(quantity), unit, state),
+                number_cell(row.value("time_frame"), "s"),
+            ]
+            note = "" if row.role == "default" else _short(row)
+            lights.append(CheckRow(title, cells, note=note))
+    return lights
 
 
 def _point_table(rows: list[SweepRow]) -> Table:
