@@ -42,11 +42,12 @@ def check(
         raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
     facts: dict[str, object] = {}
     errors: list[LatticeError] = []
+    path = scene.with_suffix(".png")
     with Progress(f"check {scene.name}"), work.threads():
         if picture:
-            from rbfmuscle.display.pictures import check_picture
+            from rbfmuscle.display.pictures import check_picture, draw_scene
 
-            check_picture(scene.with_suffix(".png"))
+            check_picture(path)
         loaded, findings = _findings(scene)
         usable = bool(loaded.bones) and not any(f.level == "error" for f in findings)
         from rbfmuscle.simulation.neighbours import find_links
@@ -63,16 +64,14 @@ def check(
                 errors = discretisation_error(loaded)
             facts["accuracy"] = [asdict(error) for error in errors]
         if picture:
-            from rbfmuscle.display.pictures import draw_scene
-
-            path = scene.with_suffix(".png")
             with stage("drawing the picture"):
                 draw_scene(loaded, path)
             facts["picture"] = str(path)
     from rbfmuscle.run.info import record_scene
     from rbfmuscle.scene.check import attachment_facts
 
-    lines = [*_scene_lines(loaded, pairs), *map(str, findings)]
+    attached = attachment_facts(loaded)
+    lines = [*_scene_lines(loaded, pairs, attached), *map(str, findings)]
     lines += _plan_lines(facts["plan"]) if "plan" in facts else ()
     for error in errors:
         rms, greatest = (f"{value:.2g} {loaded.units}" for value in (error.rms, error.greatest))
@@ -80,10 +79,13 @@ def check(
             f"muscle {error.muscle}: {error.nodes} nodes are {rms} RMS ({greatest} at most) "
             f"from twice as many, in frame {error.frame}"
         )
-    lines += [str(facts["picture"])] if "picture" in facts else ()
-    facts |= {"scene": record_scene(loaded), "findings": [vars(finding) for finding in findings]}
-    facts["neighbours"] = pairs
-    facts["attachments"] = [held._asdict() for held in attachment_facts(loaded)]
+    lines += [str(path)] if picture else ()
+    facts |= {
+        "scene": record_scene(loaded),
+        "findings": [vars(finding) for finding in findings],
+        "neighbours": pairs,
+        "attachments": [held._asdict() for held in attached],
+    }
     print_result(work, facts, lines)
     if not work.as_json:
         last = f"usable; next: rbfmuscle run {scene} -o results" if usable else "not usable"
@@ -132,8 +134,7 @@ def _field_notes(scene):
         logger.setLevel(level)
 
 
-def _scene_lines(scene, pairs):
-    from rbfmuscle.scene.check import attachment_facts
+def _scene_lines(scene, pairs, attached):
     from rbfmuscle.scene.objects import body_axes, from_mm
 
     yield f"{scene.name}: {len(scene.motion)} frames, lengths in {scene.units}"
@@ -151,7 +152,6 @@ def _scene_lines(scene, pairs):
             f"  joint {joint.name}: {joint.parent} to {joint.child}, "
             f"{', '.join(joint.coordinates) or joint.kind}"
         )
-    attached = attachment_facts(scene)
     for muscle in scene.muscles:
         volume = muscle.mesh.volume / from_mm(10.0, scene.units) ** 3
         yield (
@@ -163,8 +163,8 @@ def _scene_lines(scene, pairs):
                 f"    {held.end}: {held.vertices} vertices {held.how} {held.bone}, "
                 f"{held.area:.3g} cm2, {100 * held.share:.2g} % of the surface"
             )
-        others = [name for pair in pairs if muscle.name in pair for name in pair]
-        others = [name for name in others if name != muscle.name]
+        touching = [pair for pair in pairs if muscle.name in pair]
+        others = [name for pair in touching for name in pair if name != muscle.name]
         if others:
             yield f"    can touch {', '.join(others)}"
 

@@ -160,8 +160,6 @@ def named_muscles(names: str | None) -> list[str] | None:
 
 def named_scenes(scenes: Sequence[str]) -> dict[str, str]:
     """Scene files by their names, or by those of their folders where names are the same."""
-    if not scenes:
-        raise UsageError("give a scene file, or the word phantom")
     folders = [Path(path).resolve().parent.name for path in scenes]
     for names in ([Path(path).stem for path in scenes], folders):
         if len(set(names)) == len(names):

@@ -3,7 +3,6 @@
 import math
 import re
 import time
-from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -89,11 +88,12 @@ def paths(
     def kept():
         return said or (f"paths from {done} poses are in {output}" if done >= FEWEST else "")
 
-    sample = partial(sample_muscles, samples=samples, fibres=fibres, found=sampled)
     with interruption.keeping(kept):
         try:
             with Progress(loaded.name, "pose") as progress, work.threads():
-                sample(loaded, spans, progress=advance)
+                sample_muscles(
+                    loaded, spans, samples=samples, fibres=fibres, progress=advance, found=sampled
+                )
         except KeyboardInterrupt:
             said = f"{done} poses are too few to fit anything"
             if usable := [found for found in sampled if fittable(found)]:
@@ -106,15 +106,12 @@ def paths(
             raise
         rows, lines = report_fits(loaded, sampled, output, targets=targets)
     facts = {"file": str(output / "paths.xml"), "paths": rows}
-    return print_result(work, facts, lines, error=_failure(rows))
-
-
-def _failure(rows):
-    """The error that muscles did not settle at some poses; None where all did."""
     loose = [f"{row['muscle']} at {row['unsettled']} poses" for row in rows if row["unsettled"]]
-    if not loose:
-        return None
-    return SolveError(f"did not settle: {', '.join(loose)}; the paths are written all the same")
+    failed = None
+    if loose:
+        message = f"did not settle: {', '.join(loose)}; the paths are written all the same"
+        failed = SolveError(message)
+    return print_result(work, facts, lines, error=failed)
 
 
 def parse_ranges(scene: "Scene", texts: Pairs) -> "Ranges":

@@ -4,6 +4,7 @@ terminal.
 
 import json
 from collections.abc import Iterable, Iterator
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from textwrap import fill, shorten
@@ -70,14 +71,6 @@ def _wrapped(head: str, text: str) -> str:
     return fill(head + text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)
 
 
-# What a study keeps, and its page.
-STUDIES = (
-    ("compare", "comparison.json", "report.html"),
-    ("kernels", "kernels.json", "kernels.html"),
-    ("sweep", "sweep.json", "sweep.html"),
-)
-
-
 def report(
     directory: Annotated[
         Path, Parameter(help="Folder of a run, a comparison, a study of kernels or a sweep.")
@@ -122,23 +115,21 @@ def _redraw_study(directory, *, pictures):
     from rbfmuscle.folders import OutputFolder
     from rbfmuscle.studies import compare, kernels, sweep
 
-    for command, name, page in STUDIES:
+    for name, study, write_page in (
+        ("comparison.json", compare.Comparison, partial(compare.write_page, pictures=pictures)),
+        ("kernels.json", kernels.KernelStudy, kernels.write_page),
+        ("sweep.json", sweep.SweepTable, sweep.write_page),
+    ):
         path = directory / name
         if not path.exists():
             continue
-        OutputFolder(directory, command, [page])
+        OutputFolder(directory, study.command, [study.page])
         try:
             facts = json.loads(path.read_text(encoding="utf-8"))
-            if command == "compare":
-                table = compare.Comparison.model_validate(facts)
-                compare.write_page(directory, table, pictures=pictures)
-            elif command == "kernels":
-                kernels.write_page(directory, kernels.KernelStudy.model_validate(facts))
-            else:
-                sweep.write_page(directory, sweep.SweepTable.model_validate(facts))
+            write_page(directory, study.model_validate(facts))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UsageError(
                 f"{path} is not as it was written ({error!r}); run the command again"
             ) from None
-        return directory / page, facts
+        return directory / study.page, facts
     return None

@@ -1,7 +1,6 @@
 """``rbfmuscle run`` and ``rbfmuscle demo``: a scene through its motion, into a folder."""
 
 import time
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
@@ -87,9 +86,16 @@ def run(
 
         changes, loaded = parse_settings(settings), open_scene(scene)
         keep_muscles(loaded, muscles)
-        limited = partial(stream_run, frames=frames, fail_on=fail_on, progress=advance)
         try:
-            limited(loaded, output, model=model, settings=changes)
+            stream_run(
+                loaded,
+                output,
+                model=model,
+                settings=changes,
+                frames=frames,
+                fail_on=fail_on,
+                progress=advance,
+            )
         except SolveError as error:
             failed = SolveError("; ".join(filter(None, [str(error), kept()])))
             if not done:

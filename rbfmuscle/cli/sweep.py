@@ -87,7 +87,21 @@ def sweep(
             quantity=quantity or "error_rms",
             progress=progress,
         )
-    return _finish(table, output, limits, printing)
+    bad = [row for row in table.rows if row.status != "done"]
+    for row in bad[:5]:
+        reason = one_line(row.message or row.status)
+        print(f"rbfmuscle: {row.scene} {row.label}: {reason}", file=sys.stderr)
+    remedy = "the others are kept, the same command runs these again"
+    failed: RBFMuscleError | None = None
+    if bad:
+        failed = SolveError(f"{len(bad)} of {len(table.rows)} points failed; {remedy}")
+    elif beyond := list(_beyond(table, output, limits)):
+        failed = LimitExceededError("; ".join(beyond[:5]))
+    lines = [
+        *(verdict.text for verdict in table.verdicts),
+        f"{table.done} points done, {table.failed} failed, in {output}, open {output}/sweep.html",
+    ]
+    return print_result(printing, table.model_dump(), lines, error=failed)
 
 
 def _beyond(table, output, limits):
@@ -108,21 +122,3 @@ def _beyond(table, output, limits):
             )
         for lacking in unmeasured(facts, held):
             yield f"{row.scene} {row.label}: {lacking.quantity} was not measured"
-
-
-def _finish(table, output, limits, printing):
-    bad = [row for row in table.rows if row.status != "done"]
-    for row in bad[:5]:
-        reason = one_line(row.message or row.status)
-        print(f"rbfmuscle: {row.scene} {row.label}: {reason}", file=sys.stderr)
-    remedy = "the others are kept, the same command runs these again"
-    failed: RBFMuscleError | None = None
-    if bad:
-        failed = SolveError(f"{len(bad)} of {len(table.rows)} points failed; {remedy}")
-    elif beyond := list(_beyond(table, output, limits)):
-        failed = LimitExceededError("; ".join(beyond[:5]))
-    lines = [
-        *(verdict.text for verdict in table.verdicts),
-        f"{table.done} points done, {table.failed} failed, in {output}, open {output}/sweep.html",
-    ]
-    return print_result(printing, table.model_dump(), lines, error=failed)
