@@ -3,7 +3,7 @@
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
@@ -113,7 +113,7 @@ class OutputFolder:
         self._ours.update(fresh)
 
     @contextmanager
-    def staged(self, *, replaces: Iterable[str] | None = None) -> Iterator[Path]:
+    def staged(self, *, replaces: Collection[str] | None = None) -> Iterator[Path]:
         """Context of a temporary folder inside this one, whose files then take their places here.
 
         Each is renamed, so that a file is the earlier or the new one, whole. After an error nothing
@@ -134,9 +134,8 @@ class OutputFolder:
             for name in names:
                 (self.directory / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(stage / name, self.directory / name)
-            going = None if replaces is None else tuple(replaces)
             for name in others:
-                if going is None or PurePosixPath(name).parts[0] in going:
+                if replaces is None or PurePosixPath(name).parts[0] in replaces:
                     (self.directory / name).unlink(missing_ok=True)
                     self.listed.remove(name)
             self._write_list()
@@ -153,13 +152,11 @@ class OutputFolder:
         path = self.directory / name
         if path.is_symlink() or not path.is_dir():
             return path if os.path.lexists(path) and name not in self._ours else None
-        for place, folders, files in os.walk(path):
-            linked = [folder for folder in folders if os.path.islink(os.path.join(place, folder))]
-            for file in (*files, *linked):
-                inner = Path(place, file)
-                known = inner.relative_to(self.directory).as_posix() in self._ours
-                if not known and not file.startswith("."):
-                    return inner
+        for inner in path.rglob("*"):
+            folder = inner.is_dir() and not inner.is_symlink()
+            known = inner.relative_to(self.directory).as_posix() in self._ours
+            if not folder and not known and not inner.name.startswith("."):
+                return inner
         return None
 
     def _write_list(self) -> None:

@@ -208,20 +208,20 @@ def _as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
         raise ValueError(f"{name} must be an array of numbers ({reason})") from None
 
 
-def check_vectors(vectors: ArrayLike, count: int, *, name: str = "normals") -> NDArray[np.float64]:
-    """Return (count, 3) finite float64 vectors, one for each point."""
-    vectors = check_points(vectors, name=name)
+def check_vectors(vectors: ArrayLike, count: int) -> NDArray[np.float64]:
+    """Return (count, 3) finite float64 normals, one for each point."""
+    vectors = check_points(vectors, name="normals")
     if len(vectors) != count:
-        raise ValueError(f"{name} must have one row a point ({count}), got {len(vectors)}")
+        raise ValueError(f"normals must have one row a point ({count}), got {len(vectors)}")
     return vectors
 
 
-def check_values(values: ArrayLike, count: int, *, name: str = "values") -> NDArray[np.float64]:
+def check_values(values: ArrayLike, count: int) -> NDArray[np.float64]:
     """Return (count,) finite float64 values, one for each point."""
-    values = _as_floats(values, name)
+    values = _as_floats(values, "values")
     if values.shape != (count,):
-        raise ValueError(f"{name} must have shape ({count},), got {values.shape}")
-    check_finite(values, name=name)
+        raise ValueError(f"values must have shape ({count},), got {values.shape}")
+    check_finite(values, name="values")
     return values
 
 
