@@ -158,8 +158,14 @@ class NeighbourMeasures:
             side, there = self._sides[one, other], shown[other].distance
             vertices = shown[one].distance.vertices
             if met:
-                deepest = max(deepest, _deepest(vertices, there, side.allowed))
-            parted.append(_parted(vertices[side.touching], there, side.gap))
+                inside = np.flatnonzero(there.inside(vertices))
+                depth = there.unsigned(vertices[inside])
+                if side.allowed is not None:
+                    depth = depth - side.allowed[inside]
+                deepest = max(deepest, float(depth.max(initial=0.0)))
+            points = vertices[side.touching]
+            away = np.where(there.inside(points), 0.0, there.unsigned(points))
+            parted.append(np.maximum(away - side.gap, 0.0))
         return deepest, parted
 
     def _renew(self, one: str, at_rest: Floats, names: Sequence[str]) -> None:
@@ -179,23 +185,6 @@ def _spread(overlap: InputOverlap, points: Floats, reach: float) -> Floats:
     for depth, around in zip(overlap.depths, near):
         allowed[around] = np.maximum(allowed[around], depth)
     return allowed
-
-
-def _deepest(vertices: Floats, other: MeshDistance, allowed: Floats | None) -> float:
-    """Greatest depth of vertices (n, 3) in another surface beyond what is allowed (n,)."""
-    inside = np.flatnonzero(other.inside(vertices))
-    if len(inside) == 0:
-        return 0.0
-    depth = other.unsigned(vertices[inside])
-    return max(0.0, float((depth if allowed is None else depth - allowed[inside]).max()))
-
-
-def _parted(points: Floats, other: MeshDistance, gap: Floats) -> Floats:
-    """How much farther (n,) points (n, 3) are from another surface than at rest."""
-    if len(points) == 0:
-        return np.zeros(0)
-    away = np.where(other.inside(points), 0.0, other.unsigned(points))
-    return np.maximum(away - gap, 0.0)
 
 
 def _percentile(parted: Iterable[Floats]) -> float:

@@ -4,7 +4,7 @@ along the motion.
 
 import itertools
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ Coordinates = Mapping[str, float]
 # A slope is fitted over the frames within so many degrees, or millimetres of a shift, and over the
 # frames next to it. In motions by one degree moment arms then ripple about smooth curves by at most
 # 0.3 mm RMS (docs/validation.md).
-REACH = 8.0
+ARM_REACH = 8.0
 JUMP = 5.0  # the change of a moment arm is taken within so many degrees
 ROUGH = 2.0  # steps over which lengths have second differences [degree]
 # Activations that differ by less are the same.
@@ -192,31 +192,24 @@ def _roughness(
     if farthest > ROUGH * (1.0 + 1e-6) or np.ptp(angles) < 2.0 * ROUGH - 1e-9:
         return []
     order = np.argsort(angles)
-    of_length, of_path = (
-        _second_differences(angles[order], np.array([found[arm.frame] for arm in arms])[order])
-        for found in (lengths, paths)
-    )
-    allowed = of_path[np.isfinite(of_path)].max(initial=0.0)
-    found = []
-    for place, length, shortest in zip(order, of_length, of_path):
-        if math.isfinite(length):
-            beyond = max(0.0, length - allowed)
-            values = {
-                "length_roughness": length,
-                "path_roughness": shortest,
-                "roughness_beyond_path": beyond,
-            }
-            found += [arms[place]._replace(quantity=q, value=float(v)) for q, v in values.items()]
-    return found
-
-
-def _second_differences(angles: Floats, lengths: Floats) -> Floats:
-    """Magnitude (n,) of the second difference over `ROUGH` degrees of lengths (n,) at growing
-    angles (n,) [degree]; NaN nearer to an end.
-    """
+    angles = angles[order]
+    # Nearer to an end there is no second difference.
     inside = (angles >= angles[0] + ROUGH - 1e-9) & (angles <= angles[-1] - ROUGH + 1e-9)
-    before, after = (np.interp(angles + way, angles, lengths) for way in (-ROUGH, ROUGH))
-    return np.where(inside, np.abs(before - 2.0 * lengths + after), np.nan)
+    bends = []
+    for found in (lengths, paths):
+        along = np.array([found[arm.frame] for arm in arms])[order]
+        before, after = (np.interp(angles + way, angles, along) for way in (-ROUGH, ROUGH))
+        bends.append(np.abs(before - 2.0 * along + after)[inside])
+    allowed = bends[1][np.isfinite(bends[1])].max(initial=0.0)
+    rows = []
+    for place, length, shortest in zip(order[inside], *bends):
+        values = {
+            "length_roughness": length,
+            "path_roughness": shortest,
+            "roughness_beyond_path": max(0.0, length - allowed),
+        }
+        rows += [arms[place]._replace(quantity=q, value=float(v)) for q, v in values.items()]
+    return rows
 
 
 def _smoothness(arms: Sequence[Row], *, guessed: bool) -> list[Row]:
@@ -259,8 +252,7 @@ def _moments(scene, path, found, active):
     lengths = np.array([found.get(index, unknown) for index in path])
     known = all_coordinates(scene.joints)
     shifts = {name for name, fact in known.items() if fact.motion == "translation"}
-    names = {name for coordinates in path.values() for name in coordinates}
-    reach = reaches(names, shifts, scene.units)
+    reach = dict.fromkeys(shifts, from_mm(ARM_REACH, scene.units))
     frames = list(path.values())
     arms = moment_arms(frames, lengths, reach, [active.get(index, 0.0) for index in path])
     everywhere = moment_arms(frames, lengths, reach) if active else arms
@@ -272,14 +264,6 @@ def _moments(scene, path, found, active):
             yield moment_arm, Row(index, name, angle, "", "moment_arm", 0.0, unit)
 
 
-def reaches(names: Iterable[str], shifts: Collection[str], units: str) -> dict[str, float]:
-    """Over how much of each of some coordinates moment arms are fitted [radian, or of ``shifts``
-    scene unit].
-    """
-    near = from_mm(REACH, units)
-    return {name: near if name in shifts else math.radians(REACH) for name in names}
-
-
 def moment_arms(
     path: Sequence[Mapping[str, float]],
     lengths: ArrayLike,
@@ -289,18 +273,18 @@ def moment_arms(
     """Moment arms -dl/dq along a motion, for each frame by coordinate that moves alone before or
     after it, at one activation.
 
-    A parabola is fitted to the ``lengths`` [scene unit] of the frames within ``reach`` [radian or
-    scene unit, `REACH` degrees by default], and always of the three nearest ones in the order of
-    the motion, as far as the coordinate goes on alone and in one direction and ``activations`` (n,)
-    stay: of second order at the ends too, where there are three. ``path`` holds the coordinates of
-    each frame; lengths (n,), or of several lines (n, m), are NaN where not known. Moment arms (),
-    or (m,), are in scene units per radian, or 1.
+    A parabola is fitted to the ``lengths`` [scene unit] of the frames within `ARM_REACH` degrees,
+    or within the ``reach`` of a shift [scene unit], and always of the three nearest ones in the
+    order of the motion, as far as the coordinate goes on alone and in one direction and
+    ``activations`` (n,) stay: of second order at the ends too, where there are three. ``path``
+    holds the coordinates of each frame; lengths (n,), or of several lines (n, m), are NaN where not
+    known. Moment arms (), or (m,), are in scene units per radian, or 1.
     """
     values, found = np.asarray(lengths, dtype=float), [dict[str, Floats]() for _ in path]
     active = np.zeros(len(path)) if activations is None else np.asarray(activations)
     for name, first, last in _single_motions(path, values, active):
         at = np.array([path[k].get(name, 0.0) for k in range(first, last + 1)])
-        wide = math.radians(REACH) if reach is None else reach[name]
+        wide = (reach or {}).get(name, math.radians(ARM_REACH))
         for k in range(first, last + 1):
             near = np.abs(at - at[k - first]) <= wide
             start = max(0, min(k - first - 1, len(at) - 3))

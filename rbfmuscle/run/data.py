@@ -19,13 +19,13 @@ from pydantic import ValidationError
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL, Row
-from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.metrics.rows import ARM_REACH, moment_arms
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import frame_file, read_fibres, read_vtp
 from rbfmuscle.scene.joints import full_name
 from rbfmuscle.scene.meshes.repair import InputOrder
-from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes
+from rbfmuscle.scene.objects import MM_PER_UNIT, body_axes, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.scene.tendons import tendon_name
 from rbfmuscle.simulation.frame import Event, FibreLines, Frame, Mesh, ModelSurface
@@ -313,7 +313,7 @@ class MuscleRun:
         known = sorted({name for coordinates in path for name in coordinates})
         name = full_name(coordinate, known, context="moment_arms")
         scene = self.run.info.scene
-        reach = reaches(known, scene.coordinate_units, scene.units)
+        reach = dict.fromkeys(scene.coordinate_units, from_mm(ARM_REACH, scene.units))
         lengths = self.fibre_lengths
         out = np.full(lengths.shape, np.nan)
         for row, found in zip(out, moment_arms(path, lengths, reach)):

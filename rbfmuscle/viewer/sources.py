@@ -14,7 +14,7 @@ from rbfmuscle.fibres import build_bundles
 from rbfmuscle.geometry.arrays import Floats, unit
 from rbfmuscle.geometry.surfaces import clustered
 from rbfmuscle.metrics.centreline import Centreline
-from rbfmuscle.metrics.rows import moment_arms, reaches
+from rbfmuscle.metrics.rows import ARM_REACH, moment_arms
 from rbfmuscle.metrics.verdict import describe_doubts
 from rbfmuscle.models import build_models, configure_scene, model_names
 from rbfmuscle.run.appearance import muscle_colours, muscle_groups, tendon_mesh
@@ -172,7 +172,7 @@ class LiveFigure:
         self._bundles = build_bundles(scene, models)
         known = all_coordinates(scene.joints)
         shifts = {name for name, fact in known.items() if fact.motion == "translation"}
-        self._reach = reaches(known, shifts, scene.units)
+        self._reach = dict.fromkeys(shifts, from_mm(ARM_REACH, scene.units))
         meshes = {model.name: model.material_mesh() for model in models}
         self._lines = {
             muscle.name: Centreline(muscle, scene.joints, *meshes[muscle.name])
