@@ -15,9 +15,8 @@ import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import triangle_normal
 from rbfmuscle.geometry.frames import cross, dot
-from rbfmuscle.geometry.surfaces import volume_cubic, volume_loop
+from rbfmuscle.geometry.surfaces import triangle_plane, volume_cubic, volume_loop
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import BoneContacts
 
@@ -58,7 +57,7 @@ class ContactConstraint:
 
     def depth(self, points: Floats) -> float:
         """Greatest depth of the vertices in the half-spaces found last, 0 outside."""
-        return _greatest_depth(points, self.planes)
+        return float(plane_depths(points, self.planes).max(initial=0.0))
 
     def project(self, points: Floats) -> None:
         """Push vertices out of the half-spaces, in place."""
@@ -75,13 +74,6 @@ def plane_depths(points, planes):
             value += planes.normal[c, a] * (points[planes.point[c], a] - planes.anchor[c, a])
         depth[c] = max(0.0, -value)
     return depth
-
-
-@loop
-def _greatest_depth(points, planes):
-    """Greatest depth of a point in its half-space, 0 where all are outside."""
-    depth = plane_depths(points, planes)
-    return depth.max() if len(depth) > 0 else 0.0
 
 
 @loop
@@ -176,7 +168,8 @@ class VolumeConstraint:
     def __init__(self, vertices: Floats, faces: Integers) -> None:
         self.faces = np.ascontiguousarray(faces)
         self.rest = self.volume(vertices)
-        # A slope below this is rounding: the direction shifts the surface along itself.
+        # A slope below this, for a greatest component of 1, is rounding: the direction shifts the
+        # surface along itself.
         self._least = 1e-13 * abs(self.rest) ** (2 / 3)
 
     def volume(self, points: Floats) -> float:
@@ -189,15 +182,6 @@ class VolumeConstraint:
         _volume_gradient_loop(points, self.faces, out)
         return out
 
-    def project(self, points: Floats, inverse_mass: Floats) -> None:
-        """One PBD projection along the plain gradient, in place: the rough step of the paper's
-        figure 8.
-        """
-        step = self.gradient(points) * inverse_mass[:, None]
-        slope = (step * step).sum()
-        if slope > 0.0:
-            points += step * ((self.rest - self.volume(points)) / slope)
-
     def restore(
         self, points: Floats, direction: Floats, planes: ContactPlanes = NO_PLANES
     ) -> float:
@@ -208,22 +192,12 @@ class VolumeConstraint:
         direction cannot meet it (no real root near zero), nothing moves and s is 0. What leads into
         half-spaces is taken out of the direction, in place.
         """
-        return _restore_loop(points, self.faces, direction, self.rest, self._least, planes)
-
-
-@loop
-def _restore_loop(points, faces, direction, rest, least, planes):
-    """Move points along a direction to the rest volume; ``least`` is the slope that counts as none
-    for a direction whose greatest component is 1.
-    """
-    least *= np.abs(direction).max()
-    s = _cubic_step(volume_cubic(points, faces, direction), rest, least)
-    if clear_way(points, planes, direction, s):
-        s = _cubic_step(volume_cubic(points, faces, direction), rest, least)
-    for i in range(len(points)):
-        for a in range(3):
-            points[i, a] += s * direction[i, a]
-    return s
+        least = self._least * float(np.abs(direction).max())
+        step = _cubic_step(volume_cubic(points, self.faces, direction), self.rest, least)
+        if clear_way(points, planes, direction, step):
+            step = _cubic_step(volume_cubic(points, self.faces, direction), self.rest, least)
+        points += step * direction
+        return step
 
 
 @loop
@@ -284,7 +258,7 @@ def _volume_gradient_loop(points, faces, out):
     c / 6.
     """
     for f in range(len(faces)):
-        normal = triangle_normal(points, faces, f)
+        normal = triangle_plane(points, faces, f)[3]
         for v in faces[f]:
             for k in range(3):
                 out[v, k] += normal[k] / 6.0

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from pbd_baseline.constraints import ContactConstraint
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.rest import PBDOptions, RestState
-from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
+from pbd_baseline.settling import MeshSettling, MovingSurface
 from pbd_baseline.shapes import METHODS, Method
 from rbfmuscle.geometry.arrays import to_world
 from rbfmuscle.geometry.frames import diameter
@@ -94,7 +94,12 @@ class PBDMuscle:
         self.log = SolveLog(solver_residual=0.0)
         self._contacts: BoneContacts
         self._surface: MovingSurface | None = None
-        self.attached_bone = _bone_numbers(self.rest, attachment_frames(scene.bones, muscle))
+        frames = attachment_frames(scene.bones, muscle)
+        numbers = np.array([frames.index(bone) for bone in self.rest.bones])
+        #: Number of the bone, or end of a tendon, that holds each vertex, -1 where it is free.
+        self.attached_bone = np.where(
+            self.rest.attached_bone < 0, -1, numbers[self.rest.attached_bone]
+        )
         self.contact = ContactConstraint(reach=from_mm(REACH, scene.units))
         self.finishing_reach = from_mm(FINISHING_REACH, scene.units)
         self.depth = from_mm(DEPTH, scene.units)
@@ -113,7 +118,8 @@ class PBDMuscle:
         """Go along with the bones; held vertices arrive exactly."""
         bones, rest = self.rest.bones, self.rest
         old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
-        motions = _relative(old, new)
+        motions = new @ np.linalg.inv(old)
+        motions[(old == new).all(axis=(1, 2))] = IDENTITY  # exactly
         self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
         if not (motions == IDENTITY).all():
             self.points[:] = blended_motion(self.points, rest.weights, motions)
@@ -126,8 +132,15 @@ class PBDMuscle:
         self._contacts = contacts
         if self._surface is not None:
             self._surface.move(self.points)
-        sweeps = Sweeps(self._sweep, self.most_sweeps, self.still)
-        return MeshSettling(self.points, self.rest.inverse_mass, self.size, sweeps, self._surface)
+        return MeshSettling(
+            self.points,
+            self.rest.inverse_mass,
+            self.size,
+            self._sweep,
+            most=self.most_sweeps,
+            still=self.still,
+            surface=self._surface,
+        )
 
     def _sweep(self, number: int) -> None:
         """One sweep of this number, in place."""
@@ -136,14 +149,25 @@ class PBDMuscle:
             self.contact.find(self._contacts, self.points)
         if self.fibres is not None and (fresh or not self.fibres.passive):
             self.shape.contract(self.fibres, self.points)
-        sweep_once(self)
+        self.shape.sweep(self.points, self.time / self.sweeps)
+        self.contact.project(self.points)
+        if self.shape.volume_in_sweeps or self.still > 0.0:
+            self.shape.restore_volume(self.points, self.contact)
 
     def take(self, moving: MeshSettling) -> None:
-        """Finish where the sweeps ended."""
+        """Finish where the sweeps ended: contact and volume in turn, half-spaces found again, until
+        both hold where the bones are now known to be, or `FINISHING_ROUNDS` are over.
+        """
         self.swept = moving.iterations
-        capped = self.still > 0.0 and not moving.moved < self.still
-        _finish(self, self._contacts)
-        capped = int(capped) + int(self.penetration > self.depth)
+        for _ in range(FINISHING_ROUNDS):
+            depth = self.contact.find(self._contacts, self.points, reach=self.finishing_reach)
+            self.contact.project(self.points)
+            self.shape.restore_volume(self.points, self.contact)
+            if depth <= self.depth:
+                break
+        self.penetration = self.contact.depth(self.points)
+        unsettled = self.still > 0.0 and not moving.moved < self.still
+        capped = int(unsettled) + int(self.penetration > self.depth)
         self.log.add(caps=capped, solver_residual=moving.moved / self.size)
 
     def body(self) -> Body:
@@ -208,35 +232,6 @@ class PBDMuscle:
         return ModelSurface(np.take(shown, self._place, axis=0), self._faces, quantities, notes)
 
 
-def sweep_once(muscle: PBDMuscle) -> None:
-    """One iteration, in place."""
-    shape, points = muscle.shape, muscle.points
-    shape.sweep(points, muscle.time / muscle.sweeps)
-    muscle.contact.project(points)
-    if shape.volume_in_sweeps or muscle.still > 0.0:
-        shape.restore_volume(points, muscle.contact)
-
-
-def _finish(muscle: PBDMuscle, contacts: BoneContacts) -> None:
-    """Contact and volume in turn, half-spaces found again, until both hold where the bones are now
-    known to be, or `FINISHING_ROUNDS` are over.
-    """
-    contact, points = muscle.contact, muscle.points
-    for _ in range(FINISHING_ROUNDS):
-        depth = contact.find(contacts, points, reach=muscle.finishing_reach)
-        contact.project(points)
-        muscle.shape.restore_volume(points, contact)
-        if depth <= muscle.depth:
-            break
-    muscle.penetration = contact.depth(points)
-
-
-def _bone_numbers(rest, names):
-    """Number of the bone, or end of a tendon, that holds each vertex, -1 where it is free."""
-    numbers = np.array([names.index(bone) for bone in rest.bones])
-    return np.where(rest.attached_bone < 0, -1, numbers[rest.attached_bone])
-
-
 @loop
 def _place_loop(rest, attached_bone, poses, points):
     """Put held vertices where their bones' poses (b, 4, 4) take them."""
@@ -247,13 +242,6 @@ def _place_loop(rest, attached_bone, poses, points):
                 points[i, a] = poses[b, a, 3]
                 for k in range(3):
                     points[i, a] += poses[b, a, k] * rest[i, k]
-
-
-def _relative(before, after):
-    """Motions (b, 4, 4) between poses (b, 4, 4), exactly none of what stands still."""
-    motions = after @ np.linalg.inv(before)
-    motions[(before == after).all(axis=(1, 2))] = IDENTITY
-    return motions
 
 
 def _largest_angle(motions):

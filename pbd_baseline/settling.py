@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.exact_distance import nearest_weights, triangle_normal
+from rbfmuscle.geometry.exact_distance import nearest_weights
+from rbfmuscle.geometry.frames import cross, divided, dot, minus, plus, row_of
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.geometry.mesh_distance import winding_loop
 from rbfmuscle.geometry.surfaces import farthest_move, touching_balls, vertex_normals
@@ -26,18 +27,6 @@ DEEPER = 1.5
 RIM = 0.7
 # Depth, in mean edges, beyond which a point is inside only where its winding number says so.
 FOLDED = 0.3
-
-
-class Skin(NamedTuple):
-    """Vertices, their normals, faces, and the faces around vertex v, ring[start[v] : start[v
-    + 1]].
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray
-    faces: np.ndarray
-    start: np.ndarray
-    ring: np.ndarray
 
 
 class MovingSurface:
@@ -91,10 +80,10 @@ class MovingSurface:
         these replace. The corners of the triangle that is nearest, and their shares, are filled
         into ``columns`` and ``shares`` (n, 3), the outward normals into ``normal`` (n, 3).
         """
-        skin = Skin(self.vertices, self.normals, self.faces, self.start, self.ring)
+        skin = self.vertices, self.faces, self.start, self.ring
         away, distance = np.empty(len(points)), np.empty(len(points))
         _walk_loop(points, skin, nearest, away)
-        _distance_loop(points, nearest, skin, columns, shares, distance, normal)
+        _distance_loop(points, nearest, skin, self.normals, columns, shares, distance, normal)
         # Beyond a sharp rim the normals of its sides disagree: no point is deeper than the muscle
         # is thick.
         distance[(away > self.reach + self.edge) | (distance < -self.deepest[nearest])] = np.inf
@@ -109,9 +98,13 @@ class MovingSurface:
 
 @loop
 def _walk_loop(points, skin, nearest, away):
-    """From vertices over edges to the nearest ones, and how far away these are."""
-    vertices, _, faces, start, ring = skin
+    """From vertices over edges to the nearest ones, and how far away these are.
+
+    The ``skin`` is vertices, faces, and the faces around vertex v, ring[start[v] : start[v + 1]].
+    """
+    vertices, faces, start, ring = skin
     for q in range(len(points)):
+        at = row_of(points, q)
         here = nearest[q]
         least = np.inf
         last = -1
@@ -119,99 +112,71 @@ def _walk_loop(points, skin, nearest, away):
             last = here
             for r in range(start[last], start[last + 1]):
                 for corner in range(3):
-                    v, square = faces[ring[r], corner], 0.0
-                    for k in range(3):
-                        square += (vertices[v, k] - points[q, k]) ** 2
+                    v = faces[ring[r], corner]
+                    way = minus(row_of(vertices, v), at)
+                    square = dot(way, way)
                     if square < least:
                         least, here = square, v
         nearest[q], away[q] = here, np.sqrt(least)
 
 
-class _Foot(NamedTuple):
-    """The place of a surface that is nearest to a point."""
-
-    weights: np.ndarray  # (3,) of the corners of its triangle
-    way: np.ndarray  # (3,) from there to the point
-    true: np.ndarray  # (3,) sum of the unit normals of the triangles that meet there
-
-
 @loop
-def _distance_loop(points, nearest, skin, columns, shares, distance, normal):
+def _distance_loop(points, nearest, skin, normals, columns, shares, distance, normal):
     """Fill distances, normals and the corners and shares of the nearest places."""
-    foot = _Foot(np.empty(3), np.empty(3), np.empty(3))
-    at, weights = np.empty(3), np.empty(3)
     for q in range(len(points)):
-        least, face = _find_foot(points[q], nearest[q], skin, weights, at, foot)
-        for corner in range(3):
-            columns[q, corner] = skin[2][face, corner]
-            shares[q, corner] = foot.weights[corner]
-        size = 0.0
-        side = 0.0
-        agree = 0.0
+        least, face, weights, way, true = _find_foot(row_of(points, q), nearest[q], skin)
+        one, two, three = row_of(skin[1], face)
+        columns[q, 0] = one
+        columns[q, 1] = two
+        columns[q, 2] = three
         for k in range(3):
-            n = 0.0
-            for corner in range(3):
-                n += foot.weights[corner] * skin[1][skin[2][face, corner], k]
-            normal[q, k] = n
-            size += n * n
-            side += foot.true[k] * foot.way[k]
-            agree += n * foot.way[k]
-        length, size = np.sqrt(least), max(np.sqrt(size), 1e-300)
-        sign = 1.0 if side >= 0.0 else -1.0
+            shares[q, k] = weights[k]
+            normal[q, k] = (
+                weights[0] * normals[one, k]
+                + weights[1] * normals[two, k]
+                + weights[2] * normals[three, k]
+            )
+        mean = row_of(normal, q)
+        length, size = np.sqrt(least), max(np.sqrt(dot(mean, mean)), 1e-300)
+        sign = 1.0 if dot(true, way) >= 0.0 else -1.0
         # Around a rim normals vary fast: the direction from the nearest point is better.
-        along = sign * agree < RIM * size * length
+        along = sign * dot(mean, way) < RIM * size * length
         for k in range(3):
-            normal[q, k] = sign * foot.way[k] / length if along else normal[q, k] / size
+            normal[q, k] = sign * way[k] / length if along else mean[k] / size
         distance[q] = sign * length
 
 
-@loop()
-def _find_foot(point, vertex, skin, weights, at, foot):
-    """Squared distance of a point from the triangles about a vertex, and the nearest of these;
-    fills the foot. ``weights`` and ``at`` (3,) are room for those of one triangle.
+@loop
+def _find_foot(point, vertex, skin):
+    """The place nearest to a point on the triangles about a vertex: its squared distance, its
+    triangle, the weights of the corners of this, the way from there to the point, and the sum of
+    the unit normals of the triangles that meet there.
     """
-    vertices, _, faces, start, ring = skin
+    vertices, faces, start, ring = skin
     least, face = np.inf, -1
+    best, way, true = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for r in range(start[vertex], start[vertex + 1]):
         f = ring[r]
-        nearest_weights(
-            point, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]], weights
+        a = row_of(vertices, faces[f, 0])
+        b = row_of(vertices, faces[f, 1])
+        c = row_of(vertices, faces[f, 2])
+        weights = nearest_weights(point, a, b, c)
+        here = (
+            point[0] - weights[0] * a[0] - weights[1] * b[0] - weights[2] * c[0],
+            point[1] - weights[0] * a[1] - weights[1] * b[1] - weights[2] * c[1],
+            point[2] - weights[0] * a[2] - weights[1] * b[2] - weights[2] * c[2],
         )
-        squared = 0.0
-        for k in range(3):
-            here = point[k]
-            for corner in range(3):
-                here -= weights[corner] * vertices[faces[f, corner], k]
-            squared += here * here
-            at[k] = here
+        squared = dot(here, here)
         # The triangles that meet at the nearest point decide the side together.
         same = squared <= least * (1.0 + 1e-9) and squared >= least * (1.0 - 1e-9)
         if squared < least or same:
-            if not same:
-                foot.true[:] = 0.0
-            _add_unit_normal(vertices, faces, f, foot.true)
+            outward = cross(minus(b, a), minus(c, a))
+            outward = divided(outward, max(np.sqrt(dot(outward, outward)), 1e-300))
+            true = plus(true, outward) if same else outward
         if squared < least:
             least, face = squared, f
-            foot.weights[:], foot.way[:] = weights, at
-    return least, face
-
-
-@loop
-def _add_unit_normal(vertices, faces, f, total):
-    """Add the unit normal of a triangle."""
-    x, y, z = triangle_normal(vertices, faces, f)
-    size = max(np.sqrt(x * x + y * y + z * z), 1e-300)
-    total[0] += x / size
-    total[1] += y / size
-    total[2] += z / size
-
-
-class Sweeps(NamedTuple):
-    """Which sweeps a mesh muscle makes."""
-
-    sweep: Callable[[int], None]  # does one, of this number, on the points in place
-    most: int
-    still: float  # a motion of vertices that ends them; 0 for none [scene unit]
+            best, way = weights, here
+    return least, face, best, way, true
 
 
 class MeshRows(NamedTuple):
@@ -234,7 +199,9 @@ class MeshRows(NamedTuple):
 class MeshSettling:
     """One mesh muscle on its way to rest; implements ``rbfmuscle.simulation.touching.Moving``.
 
-    ``points`` (n, 3) are moved in place; ``surface`` is what others meet, None where none do.
+    ``points`` (n, 3) are moved in place, by ``sweep``, which is called with the number of each
+    sweep: ``most`` times, or until no vertex moves by as much as ``still`` [scene unit].
+    ``surface`` is what others meet, None where none do.
     """
 
     def __init__(
@@ -242,8 +209,11 @@ class MeshSettling:
         points: Floats,
         inverse_mass: Floats,
         size: float,
-        sweeps: Sweeps,
-        surface: MovingSurface | None,
+        sweep: Callable[[int], None],
+        *,
+        most: int,
+        still: float = 0.0,
+        surface: MovingSurface | None = None,
     ) -> None:
         self.size = size
         self.nodes = points
@@ -253,7 +223,9 @@ class MeshSettling:
         self.iterations = 0
         self.moved = np.inf
         self.inverse_mass = inverse_mass
-        self.sweeps = sweeps
+        self.sweep = sweep
+        self.most = most
+        self.still = still
         self.surface = surface
 
     def free_step(self) -> None:
@@ -262,7 +234,7 @@ class MeshSettling:
             self.step[:] = 0.0
             return
         before = self.nodes.copy()
-        self.sweeps.sweep(self.iterations)
+        self.sweep(self.iterations)
         self.step = self.nodes - before
         self.nodes[:] = before
 
@@ -304,7 +276,7 @@ class MeshSettling:
         self.moved = farthest_move(before, self.nodes)
         if self.surface is not None:
             self.surface.move(self.nodes)
-        self.asleep = self.moved < self.sweeps.still or self.iterations >= self.sweeps.most
+        self.asleep = self.moved < self.still or self.iterations >= self.most
 
     def ask(self, points: Floats, place: Integers) -> tuple[Floats, Floats, Embedding]:
         """Gaps (k,) of points (k, 3) to this muscle, their normals (k, 3) and feet; the search

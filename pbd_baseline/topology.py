@@ -11,6 +11,7 @@ import scipy.sparse as sparse
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
+from rbfmuscle.geometry.surfaces import opposite_half_edges
 from rbfmuscle.loops import loop
 from rbfmuscle.validation import MeshError, check_mesh
 
@@ -60,21 +61,19 @@ class Topology:
 
 
 def _edges_and_wings(faces):
-    half = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    opposite = np.concatenate([faces[:, 2], faces[:, 0], faces[:, 1]])
-    along = half[:, 0] < half[:, 1]
-    if (half[:, 0] == half[:, 1]).any():
+    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    if (tail == head).any():
         raise MeshError("the muscle has a face that uses one vertex twice")
-    forward, backward = half[along], half[~along][:, ::-1]
-    first, second = np.lexsort(forward.T[::-1]), np.lexsort(backward.T[::-1])
-    forward, backward = forward[first], backward[second]
-    closed = len(forward) == len(backward) and np.array_equal(forward, backward)
-    if not closed or (len(forward) > 1 and (np.diff(forward, axis=0) == 0).all(axis=1).any()):
+    opposite = opposite_half_edges(faces)
+    if (opposite < 0).any():
         raise MeshError(
             "the muscle is not a closed, consistently oriented 2-manifold; repair it first"
         )
-    wings = np.column_stack([opposite[along][first], opposite[~along][second]])
-    return np.ascontiguousarray(forward), np.ascontiguousarray(wings)
+    along = np.flatnonzero(tail < head)
+    along = along[np.lexsort((head[along], tail[along]))]
+    apex = np.roll(faces, -2, axis=1).ravel()
+    edges = np.column_stack([tail[along], head[along]])
+    return edges, np.column_stack([apex[along], apex[opposite[along]]])
 
 
 def _one_rings(edges, count):

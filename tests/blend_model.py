@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from toy_scene import ToyMuscle, ellipsoid, held
 
-from pbd_baseline.settling import MeshSettling, Sweeps
+from pbd_baseline.settling import MeshSettling
 from rbfmuscle.geometry.harmonic import harmonic_weights
 from rbfmuscle.scene.options import OutputOptions
 from rbfmuscle.scene.scene import Scene
@@ -35,7 +35,7 @@ class BlendMuscle(ToyMuscle):
         if self.solves == self.fail_at:
             raise SolveError(f"muscle {self.name!r}: planted failure")
         free = np.where(self.attached_bone < 0, 1.0, 0.0)
-        return MeshSettling(self.x, free, 60.0, Sweeps(lambda number: None, 1, 0.0), None)
+        return MeshSettling(self.x, free, 60.0, lambda number: None, most=1)
 
     def surface(self, contacts):
         quantities = {

@@ -63,7 +63,7 @@ class Drawn:
 
     def forget(self):
         self.level = 0.0
-        self.bones = ShownBones(self.shown, self.contacts, self.grids)
+        self.bones = ShownBones(self.shown, self.contacts.bones, self.contacts.placed, self.grids)
 
     def __call__(self, carried, *, fitted=True, displacement=None):
         """Vertices, triangles that cross, whether there is a level, and what was bounded."""

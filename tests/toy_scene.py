@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import trimesh
 
-from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
+from pbd_baseline.settling import MeshSettling, MovingSurface
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.bone import Bone
@@ -140,7 +140,7 @@ class ToyMuscle(MuscleModel):
             self.x[:] = press(self.target, self.x, self.inverse, near.point, near.gap, near.normal)
 
         free = np.where(self.attached_bone < 0, 1.0, 0.0)
-        return MeshSettling(self.x, free, 60.0, Sweeps(sweep, self.sweeps, 0.0), self._surface)
+        return MeshSettling(self.x, free, 60.0, sweep, most=self.sweeps, surface=self._surface)
 
     def take(self, moving):
         pass

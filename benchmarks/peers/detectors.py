@@ -80,7 +80,7 @@ class TreeDetector(PointDetector):
     @property
     def memory(self) -> int:
         """Bytes of the tree and its triangles."""
-        arrays = (self.exact.boxes, self.exact.records, *self.exact.pseudonormals)
+        arrays = (self.exact.tree.boxes, self.exact.tree.records, *self.exact.pseudonormals)
         return sum(array.nbytes for array in arrays)
 
     def _local(self, points):
@@ -142,17 +142,14 @@ class VoxelDetector(PointDetector):
 def grid_of(mesh: MeshLike) -> tuple[Any, Floats, Floats]:
     """Exact distance of a mesh, and the box (low, high) of a baseline's grid around it."""
     vertices, faces = (mesh.vertices, mesh.faces) if hasattr(mesh, "faces") else mesh
-    bone = prepare_bone(np.asarray(vertices), np.asarray(faces))
-    exact = ExactDistance(bone.vertices, bone.faces)
-    low, high = bone.vertices.min(axis=0), bone.vertices.max(axis=0)
+    vertices = np.asarray(vertices, dtype=float)
+    faces, closed, _ = prepare_bone(vertices, np.asarray(faces))
+    exact = ExactDistance(vertices, faces)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
     margin = MARGIN * (high - low).max()
-    if bone.closed:
+    if closed:
         return exact, low - margin, high + margin
-    return (
-        _WoundDistance(exact, inside_test(bone.vertices, bone.faces)),
-        low - margin,
-        high + margin,
-    )
+    return _WoundDistance(exact, inside_test(vertices, faces)), low - margin, high + margin
 
 
 class _WoundDistance:

@@ -28,7 +28,15 @@ class InterleavedARAPShape(GlobalARAPShape):
 
     def restore_volume(self, points, contact):
         """One projection along the plain gradient, in place, whatever lies in the way."""
-        self.volume.project(points, self.inverse_mass)
+        project_volume(self.volume, points, self.inverse_mass)
+
+
+def project_volume(volume, points, inverse_mass):
+    """One PBD projection along the plain gradient, in place."""
+    step = volume.gradient(points) * inverse_mass[:, None]
+    slope = (step * step).sum()
+    if slope > 0.0:
+        points += step * ((volume.rest - volume.volume(points)) / slope)
 
 
 class DeepestContact(ContactConstraint):

@@ -14,20 +14,19 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import (
     BX,
-    CORNER,
     CX,
     CY,
-    EDGE,
     FACE,
-    FIRST,
-    INVERSE_BC,
-    INVERSE_CA,
     STACK,
     ExactDistance,
-    nearest_in_frame,
+    box_square,
+    feature_normal,
     nearest_triangle,
+    offset_in_frame,
     record_square,
 )
+from rbfmuscle.geometry.mesh_distance import half_solid_angle
+from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
 
 # Relative difference of squared distances below which triangles count as equally near: rounding in
@@ -75,9 +74,10 @@ class Memory(NamedTuple):
 
 def bone_arrays(exact: ExactDistance, *, closed: bool) -> BoneArrays:
     """Arrays of a mesh; ``closed`` says that it is closed and does not intersect itself."""
-    dipoles = np.empty((0 if closed else len(exact.boxes), 6))
+    boxes, starts, records, _ = exact.tree
+    dipoles = np.empty((0 if closed else len(boxes), 6))
     if not closed:
-        _dipole_loop(exact.boxes, exact.starts, exact.records, dipoles)
+        _dipole_loop(boxes, starts, records, dipoles)
     return BoneArrays(*exact.tree, *exact.pseudonormals, exact.faces, dipoles)
 
 
@@ -114,24 +114,19 @@ def _dipole_loop(boxes, starts, records, dipoles):
 
 @loop
 def _solid_angle(record, x, y, z):
-    """Half the solid angle of a triangle (Van Oosterom & Strackee 1983)."""
-    ax = record[0] - x
-    ay = record[1] - y
-    az = record[2] - z
-    bx = ax + record[BX] * record[3]
-    by = ay + record[BX] * record[4]
-    bz = az + record[BX] * record[5]
-    cx = ax + record[CX] * record[3] + record[CY] * record[6]
-    cy = ay + record[CX] * record[4] + record[CY] * record[7]
-    cz = az + record[CX] * record[5] + record[CY] * record[8]
-    a = np.sqrt(ax * ax + ay * ay + az * az)
-    b = np.sqrt(bx * bx + by * by + bz * bz)
-    c = np.sqrt(cx * cx + cy * cy + cz * cz)
-    volume = ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)
-    ab = ax * bx + ay * by + az * bz
-    bc = bx * cx + by * cy + bz * cz
-    ca = cx * ax + cy * ay + cz * az
-    return np.arctan2(volume, a * b * c + ab * c + bc * a + ca * b)
+    """Half the solid angle of the triangle of a record."""
+    a = record[0] - x, record[1] - y, record[2] - z
+    b = (
+        a[0] + record[BX] * record[3],
+        a[1] + record[BX] * record[4],
+        a[2] + record[BX] * record[5],
+    )
+    c = (
+        a[0] + record[CX] * record[3] + record[CY] * record[6],
+        a[1] + record[CX] * record[4] + record[CY] * record[7],
+        a[2] + record[CX] * record[5] + record[CY] * record[8],
+    )
+    return half_solid_angle(a, b, c)
 
 
 @loop
@@ -189,46 +184,14 @@ def distance_at(bone, x, y, z, triangle, stack, squares):
     square = np.inf if triangle < 0 else record_square(records, triangle, x, y, z)
     tree = (bone.boxes, bone.starts, records, bone.order)
     best = nearest_triangle(tree, (x, y, z), triangle, square, TIE, (stack, squares))[0]
-    ux = records[best, 3]
-    uy = records[best, 4]
-    uz = records[best, 5]
-    vx = records[best, 6]
-    vy = records[best, 7]
-    vz = records[best, 8]
-    nx = records[best, 9]
-    ny = records[best, 10]
-    nz = records[best, 11]
-    qx = x - records[best, 0]
-    qy = y - records[best, 1]
-    qz = z - records[best, 2]
-    w = qx * nx + qy * ny + qz * nz
-    du, dv, feature = nearest_in_frame(
-        records[best, BX],
-        records[best, CX],
-        records[best, CY],
-        records[best, INVERSE_BC],
-        records[best, INVERSE_CA],
-        qx * ux + qy * uy + qz * uz,
-        qx * vx + qy * vy + qz * vz,
-    )
+    _, (du, dv, w), feature = offset_in_frame(records, best, x, y, z)
     distance = np.sqrt(du * du + dv * dv + w * w)
     # From the nearest point to the point asked about.
-    ox = du * ux + dv * vx + w * nx
-    oy = du * uy + dv * vy + w * ny
-    oz = du * uz + dv * vz + w * nz
-    if feature != FACE:
-        face = bone.order[best]
-        first = int(records[best, FIRST])
-        if feature < CORNER:
-            k = (first + feature - EDGE) % 3
-            nx = bone.edge_normals[face, k, 0]
-            ny = bone.edge_normals[face, k, 1]
-            nz = bone.edge_normals[face, k, 2]
-        else:
-            k = bone.faces[face, (first + feature - CORNER) % 3]
-            nx = bone.vertex_normals[k, 0]
-            ny = bone.vertex_normals[k, 1]
-            nz = bone.vertex_normals[k, 2]
+    ox = du * records[best, 3] + dv * records[best, 6] + w * records[best, 9]
+    oy = du * records[best, 4] + dv * records[best, 7] + w * records[best, 10]
+    oz = du * records[best, 5] + dv * records[best, 8] + w * records[best, 11]
+    normals = bone.edge_normals, bone.vertex_normals, bone.faces, bone.order
+    nx, ny, nz = feature_normal(normals, records, best, feature)
     side = 1.0 if ox * nx + oy * ny + oz * nz >= 0.0 else -1.0
     boxes = bone.boxes
     size = boxes[1, 3] - boxes[1, 0] + boxes[1, 4] - boxes[1, 1] + boxes[1, 5] - boxes[1, 2]
@@ -254,6 +217,22 @@ def distance_at(bone, x, y, z, triangle, stack, squares):
     return side * distance, nx / length, ny / length, nz / length, best
 
 
+def distances(
+    bone: BoneArrays, pose: Floats, points: Floats, reach: Floats, known: Memory
+) -> tuple[Floats, Floats]:
+    """Signed distances (n,) of points (n, 3) to a bone in a pose, and their unit gradients (n, 3),
+    as `distance_loop` has them; what is ``known`` of the points is brought up to date.
+    """
+    distance, gradient = np.empty(len(points)), np.empty((len(points), 3))
+
+    def work(a: int, b: int) -> None:
+        memory = [part[a:b] for part in known]
+        distance_loop(bone, pose, points[a:b], reach[a:b], *memory, distance[a:b], gradient[a:b])
+
+    in_chunks(len(points), work)
+    return distance, gradient
+
+
 @loop
 def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, gradient):
     """Signed distances (n,) of points (n, 3) in the world to a bone in a pose (4, 4), and their
@@ -266,7 +245,6 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
     """
     stack = np.empty(STACK, np.int64)
     squares = np.empty(STACK)
-    box = bone.boxes[1]
     for i in range(len(points)):
         dx = points[i, 0] - pose[0, 3]
         dy = points[i, 1] - pose[1, 3]
@@ -274,10 +252,7 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
         x = pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz
         y = pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz
         z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-        ex = max(box[0] - x, x - box[3], 0.0)
-        ey = max(box[1] - y, y - box[4], 0.0)
-        ez = max(box[2] - z, z - box[5], 0.0)
-        beyond = ex * ex + ey * ey + ez * ez
+        beyond = box_square(bone.boxes, 1, x, y, z)
         moved = (x - anchor[i, 0]) ** 2 + (y - anchor[i, 1]) ** 2 + (z - anchor[i, 2]) ** 2
         least = bound[i] - np.sqrt(moved)
         if beyond > 0.0:

@@ -5,18 +5,16 @@ which triangles count, and where the sign of the distance comes from.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rbfmuscle.bones.distance import BoneArrays, Memory, bone_arrays, distance_loop, winding_loop
+from rbfmuscle.bones.distance import BoneArrays, Memory, bone_arrays, distances, winding_loop
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike, box_size, unit
 from rbfmuscle.geometry.exact_distance import ExactDistance, faces_across
 from rbfmuscle.geometry.frames import numbered_by_place, on_one_line
 from rbfmuscle.geometry.solids import outer_surface
 from rbfmuscle.geometry.surfaces import mesh_volume
-from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.validation import MeshError, check_mesh, check_points
 
 log = logging.getLogger(__name__)
@@ -25,88 +23,67 @@ log = logging.getLogger(__name__)
 LEAST_SHAPE = 1e-12
 
 
-@dataclass
-class BoneMesh:
-    """A bone's mesh as its field takes it."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    doubtful: np.ndarray  # (m,) faces at a border, whose pseudonormals give no sign
-    notes: list = field(default_factory=list)  # what was found and done, for the log
-
-    @property
-    def closed(self) -> bool:
-        """Whether each edge has one face on each side, consistently oriented."""
-        return not self.doubtful.any()
-
-
-def prepare_bone(vertices: Floats, faces: Integers, *, name: str = "bone") -> BoneMesh:
-    """Clean arrays for a distance field: no degenerate or duplicate faces, outward as far as can be
-    told.
+def prepare_bone(
+    vertices: Floats, faces: Integers, *, name: str = "bone"
+) -> tuple[Integers, bool, list[str]]:
+    """Faces for a distance field: none degenerate or double, outward as far as can be told; whether
+    each of their edges has one face on each side; and what was found and done, for the log.
 
     Closed meshes are taken as they are. Of others equal vertices are merged, and patches oriented
     alike. Raises MeshError on NaN, indices out of range, an empty mesh, or one whose faces all have
     no area.
     """
     vertices, faces = check_mesh(vertices, faces, name=name)
-    mesh = BoneMesh(vertices, faces, np.zeros(len(faces), dtype=np.bool_))
-    flat = _flat(vertices, faces)
-    if flat.any():
-        _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")
-    if len(mesh.faces) == 0:
+    notes: list[str] = []
+    faces = _with_area(vertices, faces, notes)
+    if len(faces) == 0:
         raise MeshError(f"{name} has no face with an area")
-    across = faces_across(mesh.faces)
-    if (across < 0).any() or flat.any():
-        across = _mend(mesh)
-    if (across < 0).any():
-        border = np.zeros(len(vertices), dtype=np.bool_)
-        border[mesh.faces[(across < 0).any(axis=1)]] = True
-        mesh.doubtful = border[mesh.faces].any(axis=1)
-        count = int((across < 0).sum())
-        mesh.notes.append(f"not closed ({count} open edges): the sign comes from winding numbers")
-    if mesh_volume(mesh.vertices, mesh.faces) < 0.0:
-        mesh.faces = np.ascontiguousarray(mesh.faces[:, ::-1])
-        mesh.notes.append("faces pointed inward and were turned")
-    return mesh
+    if notes or (faces_across(faces) < 0).any():
+        faces = _mended(vertices, faces, notes)
+    count = int((faces_across(faces) < 0).sum())
+    if count:
+        notes.append(f"not closed ({count} open edges): the sign comes from winding numbers")
+    if mesh_volume(vertices, faces) < 0.0:
+        faces = np.ascontiguousarray(faces[:, ::-1])
+        notes.append("faces pointed inward and were turned")
+    return faces, count == 0, notes
 
 
-def _flat(vertices, faces):
+def _with_area(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
+    """The faces that have an area; adds a note where others are left out."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     longest = np.maximum.reduce([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])
-    return area <= LEAST_SHAPE * longest
+    flat = area <= LEAST_SHAPE * longest
+    if not flat.any():
+        return faces
+    notes.append(f"{int(flat.sum())} faces without area left out")
+    return np.ascontiguousarray(faces[~flat])
 
 
-def _keep(mesh, which, note):
-    mesh.faces = np.ascontiguousarray(mesh.faces[which])
-    mesh.doubtful = np.zeros(len(mesh.faces), dtype=np.bool_)
-    mesh.notes.append(note)
-
-
-def _mend(mesh):
-    """Merge equal vertices, drop duplicate faces, orient patches alike; return the faces across."""
+def _mended(vertices: Floats, faces: Integers, notes: list[str]) -> Integers:
+    """Faces with equal vertices merged, without duplicates, in patches that are oriented alike;
+    adds notes of what was done.
+    """
     import igl
 
-    _, first, inverse = np.unique(mesh.vertices, axis=0, return_index=True, return_inverse=True)
-    if len(first) < len(mesh.vertices):
-        used = len(np.unique(mesh.faces))
-        mesh.faces = np.ascontiguousarray(first[inverse.reshape(-1)][mesh.faces])
-        repeated = used - len(np.unique(mesh.faces))
-        mesh.notes += [f"{repeated} repeated vertices merged"] if repeated else []
-        flat = _flat(mesh.vertices, mesh.faces)
-        if flat.any():
-            _keep(mesh, ~flat, f"{int(flat.sum())} faces without area left out")
-    _, kept = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
-    if len(kept) < len(mesh.faces):
-        _keep(mesh, np.sort(kept), f"{len(mesh.faces) - len(kept)} duplicate faces left out")
-    across = faces_across(mesh.faces)
-    if (across == -2).any():
-        oriented = np.ascontiguousarray(igl.bfs_orient(mesh.faces)[0])
-        if not np.array_equal(oriented, mesh.faces):
-            mesh.faces = oriented
-            mesh.notes.append("neighbouring faces were oriented alike")
-        across = faces_across(mesh.faces)
-    return across
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    if len(first) < len(vertices):
+        merged = np.ascontiguousarray(first[inverse.reshape(-1)][faces])
+        repeated = len(np.unique(faces)) - len(np.unique(merged))
+        if repeated:
+            notes.append(f"{repeated} repeated vertices merged")
+        faces = _with_area(vertices, merged, notes)
+    _, kept = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    if len(kept) < len(faces):
+        notes.append(f"{len(faces) - len(kept)} duplicate faces left out")
+        faces = np.ascontiguousarray(faces[np.sort(kept)])
+    if (faces_across(faces) == -2).any():
+        oriented = np.ascontiguousarray(igl.bfs_orient(faces)[0])
+        if not np.array_equal(oriented, faces):
+            notes.append("neighbouring faces were oriented alike")
+        faces = oriented
+    return faces
 
 
 IDENTITY = np.eye(4)
@@ -179,11 +156,11 @@ class BoneSDF:
         if on_one_line(vertices):
             raise MeshError(f"{name} has no face with an area")
         order, faces = numbered_by_place(vertices, faces)
-        found = prepare_bone(vertices[order], faces, name=name)
-        exact = ExactDistance(found.vertices, found.faces)
-        notes = [*solid, *found.notes]
+        faces, closed, found = prepare_bone(vertices[order], faces, name=name)
+        exact = ExactDistance(vertices[order], faces)
+        notes = [*solid, *found]
         arrays = bone_arrays(exact, closed=False)
-        if found.closed:
+        if closed:
             if _intersects_itself(exact, arrays):
                 notes.append("intersects itself: the sign comes from winding numbers")
             else:
@@ -229,33 +206,18 @@ class BoneSDF:
         bound is given. A ``memory`` of the same points saves time where they are asked about again
         and again, and changes no answer.
         """
-        points = np.ascontiguousarray(check_points(points))
-        pose, count = _check_pose(pose), len(points)
-        limit = np.full(count, reach, dtype=np.float64)
-        known = Memory.of(count) if memory is None else memory
-        distance, gradient = np.empty(count), np.empty((count, 3))
-
-        def work(a: int, b: int) -> None:
-            some = (known.anchor[a:b], known.bound[a:b], known.triangle[a:b])
-            out = (distance[a:b], gradient[a:b])
-            distance_loop(self.arrays, pose, points[a:b], limit[a:b], *some, *out)
-
-        in_chunks(count, work)
-        return distance, gradient
-
-
-def _check_pose(pose: ArrayLike | None) -> Floats:
-    if pose is None:
-        return IDENTITY
-    pose = np.ascontiguousarray(pose, dtype=np.float64)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
-    return pose
+        points = check_points(points)
+        pose = IDENTITY if pose is None else np.ascontiguousarray(pose, dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError(f"pose must be a finite (4, 4) transform, got shape {pose.shape}")
+        limit = np.full(len(points), reach, dtype=np.float64)
+        known = Memory.of(len(points)) if memory is None else memory
+        return distances(self.arrays, pose, points, limit, known)
 
 
 def _intersects_itself(exact: ExactDistance, arrays: BoneArrays) -> bool:
     """Whether faces of a closed mesh, spread over it, lie inside or outside another part of it."""
-    some = exact.order[:: max(1, len(exact.order) // PROBES)]
+    some = exact.tree.order[:: max(1, len(exact.faces) // PROBES)]
     corners = exact.vertices[exact.faces[some]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     behind = corners.mean(axis=1) - BEHIND * box_size(exact.vertices) * unit(normal)

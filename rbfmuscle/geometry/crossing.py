@@ -3,7 +3,8 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.surfaces import opposite_half_edges
+from rbfmuscle.geometry.frames import dot, row_of
+from rbfmuscle.geometry.surfaces import corner_from, opposite_half_edges, six_volumes
 from rbfmuscle.loops import loop
 
 # Triangles in a leaf of the tree, and bits of their places along each axis by which they are
@@ -269,12 +270,8 @@ def _meet(faces, f, g, plain):
     """
     # Without branches: nearly all pairs that touch share a corner, and which one cannot be
     # foreseen.
-    p = faces[f, 0]
-    q = faces[f, 1]
-    r = faces[f, 2]
-    a = faces[g, 0]
-    b = faces[g, 1]
-    c = faces[g, 2]
+    p, q, r = row_of(faces, f)
+    a, b, c = row_of(faces, g)
     first = (p == a) | (p == b) | (p == c)
     second = (q == a) | (q == b) | (q == c)
     third = (r == a) | (r == b) | (r == c)
@@ -294,9 +291,7 @@ def cross(vertices, faces, f, g):
 @loop
 def _straddles(vertices, faces, f, g):
     """Whether f has corners on both sides of the plane of g; those that they share lie in it."""
-    a = faces[g, 0]
-    b = faces[g, 1]
-    c = faces[g, 2]
+    a, b, c = row_of(faces, g)
     above, below = False, False
     for k in range(3):
         p = faces[f, k]
@@ -311,9 +306,7 @@ def _straddles(vertices, faces, f, g):
 @loop
 def _edges_cross(vertices, faces, f, g):
     """Whether an edge of f goes through the inside of g."""
-    a = faces[g, 0]
-    b = faces[g, 1]
-    c = faces[g, 2]
+    a, b, c = row_of(faces, g)
     for k in range(3):
         p, q = faces[f, k], faces[f, (k + 1) % 3]
         if p in (a, b, c) or q in (a, b, c):
@@ -333,20 +326,10 @@ def _side(vertices, a, b, c, d):
     """Six times the signed volume of a tetrahedron: which side of the triangle abc the point d lies
     on.
     """
-    x = vertices[a, 0]
-    y = vertices[a, 1]
-    z = vertices[a, 2]
-    ux = vertices[b, 0] - x
-    uy = vertices[b, 1] - y
-    uz = vertices[b, 2] - z
-    vx = vertices[c, 0] - x
-    vy = vertices[c, 1] - y
-    vz = vertices[c, 2] - z
-    return (
-        (uy * vz - uz * vy) * (vertices[d, 0] - x)
-        + (uz * vx - ux * vz) * (vertices[d, 1] - y)
-        + (ux * vy - uy * vx) * (vertices[d, 2] - z)
-    )
+    at = row_of(vertices, a)
+    to_b = corner_from(vertices, b, at)
+    to_c = corner_from(vertices, c, at)
+    return six_volumes(to_b, to_c, corner_from(vertices, d, at))
 
 
 def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integers, Integers]:
@@ -424,11 +407,9 @@ def _side_by_side(sides, normals, count):
     turns, outside = 0, True
     above = u * sides[0, 0] + v * sides[0, 1] + w * sides[0, 2] >= 0.0
     for k in range(count):
-        nx = normals[k, 0]
-        ny = normals[k, 1]
-        nz = normals[k, 2]
-        along = nx * x + ny * y + nz * z
-        outside &= (along > 0.0) & (along * along > square * (nx * nx + ny * ny + nz * nz))
+        normal = row_of(normals, k)
+        along = dot(normal, (x, y, z))
+        outside &= (along > 0.0) & (along * along > square * dot(normal, normal))
         below = not above
         above = u * sides[k + 1, 0] + v * sides[k + 1, 1] + w * sides[k + 1, 2] >= 0.0
         turns += below & above

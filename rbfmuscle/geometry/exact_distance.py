@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.surfaces import opposite_half_edges
+from rbfmuscle.geometry.frames import cross, divided, dot, minus, row_of
+from rbfmuscle.geometry.surfaces import corner_from, opposite_half_edges
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
 
@@ -38,80 +38,58 @@ CORNER = 4
 
 
 @loop
-def fill_records(vertices, faces, order, records):
+def _record_loop(vertices, faces, order, records):
     """Fill ``records`` (m, WIDTH) with the frames of the triangles ``faces[order]``; zero area is
     allowed.
     """
-    length = np.empty(3)
-    corner = np.empty((3, 3))
+    square = np.empty(3)
     for n in range(len(order)):
         face = order[n]
         for k in range(3):
-            total = 0.0
-            for j in range(3):
-                total += (vertices[faces[face, (k + 1) % 3], j] - vertices[faces[face, k], j]) ** 2
-            length[k] = total
-        first = 0
-        for k in range(1, 3):
-            if length[k] > length[first]:
-                first = k
+            one = row_of(vertices, faces[face, k])
+            side = corner_from(vertices, faces[face, (k + 1) % 3], one)
+            square[k] = dot(side, side)
+        first = np.argmax(square)
+        a = row_of(vertices, faces[face, first])
+        to_b = corner_from(vertices, faces[face, (first + 1) % 3], a)
+        to_c = corner_from(vertices, faces[face, (first + 2) % 3], a)
+        bx = np.sqrt(square[first])
+        x_axis = divided(to_b, bx) if bx > 0.0 else (1.0, 0.0, 0.0)
+        cx = dot(to_c, x_axis)
+        rise = minus(to_c, (cx * x_axis[0], cx * x_axis[1], cx * x_axis[2]))
+        cy = np.sqrt(dot(rise, rise))
+        if cy > 1e-14 * bx:
+            y_axis = divided(rise, cy)
+        else:
+            cy = 0.0
+            y_axis = _across(x_axis)
+        normal = cross(x_axis, y_axis)
         for k in range(3):
-            for j in range(3):
-                corner[k, j] = vertices[faces[face, (first + k) % 3], j]
-        _fill_record(corner, records[n])
+            records[n, k] = a[k]
+            records[n, 3 + k] = x_axis[k]
+            records[n, 6 + k] = y_axis[k]
+            records[n, 9 + k] = normal[k]
+        bc, ca = (cx - bx) ** 2 + cy**2, cx**2 + cy**2
+        records[n, BX] = bx
+        records[n, CX] = cx
+        records[n, CY] = cy
+        records[n, INVERSE_BC] = 1.0 / bc if bc > 0.0 else 0.0
+        records[n, INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
         records[n, FIRST] = first
 
 
 @loop
-def _fill_record(corner, record):
-    bx = 0.0
-    along = 0.0
-    cy = 0.0
-    for j in range(3):
-        record[j] = corner[0, j]
-        record[3 + j] = corner[1, j] - corner[0, j]
-        bx += record[3 + j] ** 2
-    bx = np.sqrt(bx)
-    if bx > 0.0:
-        for j in range(3):
-            record[3 + j] /= bx
-    else:
-        record[3] = 1.0
-        record[4] = 0.0
-        record[5] = 0.0
-    for j in range(3):
-        along += (corner[2, j] - corner[0, j]) * record[3 + j]
-    for j in range(3):
-        record[6 + j] = corner[2, j] - corner[0, j] - along * record[3 + j]
-        cy += record[6 + j] ** 2
-    cy = np.sqrt(cy)
-    if cy > 1e-14 * bx:
-        for j in range(3):
-            record[6 + j] /= cy
-    else:
-        cy = 0.0
-        _any_normal(record)
-    for j in range(3):
-        a, b = (j + 1) % 3, (j + 2) % 3
-        record[9 + j] = record[3 + a] * record[6 + b] - record[3 + b] * record[6 + a]
-    record[BX] = bx
-    record[CX] = along
-    record[CY] = cy
-    bc, ca = (along - bx) ** 2 + cy**2, along**2 + cy**2
-    record[INVERSE_BC] = 1.0 / bc if bc > 0.0 else 0.0
-    record[INVERSE_CA] = 1.0 / ca if ca > 0.0 else 0.0
-
-
-@loop
-def _any_normal(record):
-    least = 0
-    for j in range(1, 3):
-        if abs(record[3 + j]) < abs(record[3 + least]):
-            least = j
-    scale = 1.0 / np.sqrt(1.0 - record[3 + least] ** 2)
-    for j in range(3):
-        unit = 1.0 if j == least else 0.0
-        record[6 + j] = scale * (unit - record[3 + least] * record[3 + j])
+def _across(axis):
+    """A unit vector at a right angle to another, as near as may be to an axis of coordinates."""
+    least = np.argmin(np.abs(np.array(axis)))
+    scale = 1.0 / np.sqrt(1.0 - axis[least] ** 2)
+    along = np.zeros(3)
+    along[least] = 1.0
+    return (
+        scale * (along[0] - axis[least] * axis[0]),
+        scale * (along[1] - axis[least] * axis[1]),
+        scale * (along[2] - axis[least] * axis[2]),
+    )
 
 
 @loop
@@ -149,84 +127,38 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
     return dx, dy, feature
 
 
-def pseudonormals(vertices: Floats, faces: Integers, across: Integers) -> tuple[Floats, Floats]:
-    """Directions that sign a distance, of edges (m, 3, 3) and of vertices (n, 3).
-
-    Edge k of a face takes the sum of the unit normals of the face and of that ``across`` (m, 3) it,
-    below zero where there is none; a vertex takes the normals weighted by their angle. Faces
-    without area have no normal.
-    """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    u, v = b - a, c - a
-    normal = np.cross(u, v)
-    area = np.sqrt(np.einsum("md,md->m", normal, normal))
-    unit = np.divide(normal, area[:, None], out=np.zeros_like(normal), where=area[:, None] > 0.0)
-    at_a = np.arctan2(area, np.einsum("md,md->m", u, v))
-    at_b = np.arctan2(area, -np.einsum("md,md->m", u, v - u))
-    angles = np.column_stack([at_a, at_b, np.pi - at_a - at_b])
-    of_vertices = np.zeros((len(vertices), 3))
-    np.add.at(of_vertices, faces, angles[:, :, None] * unit[:, None])
-    return unit[:, None] + np.where((across >= 0)[:, :, None], unit[across], 0.0), of_vertices
-
-
 @loop
-def _dot(a, b, p, q):
-    """(b - a) . (p - q), without temporary arrays."""
-    return (
-        (b[0] - a[0]) * (p[0] - q[0])
-        + (b[1] - a[1]) * (p[1] - q[1])
-        + (b[2] - a[2]) * (p[2] - q[2])
-    )
-
-
-@loop
-def triangle_normal(vertices, faces, f):
-    """Normal of a triangle, twice its area long."""
-    a = faces[f, 0]
-    b = faces[f, 1]
-    c = faces[f, 2]
-    ux = vertices[b, 0] - vertices[a, 0]
-    uy = vertices[b, 1] - vertices[a, 1]
-    uz = vertices[b, 2] - vertices[a, 2]
-    vx = vertices[c, 0] - vertices[a, 0]
-    vy = vertices[c, 1] - vertices[a, 1]
-    vz = vertices[c, 2] - vertices[a, 2]
-    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-
-
-@loop
-def nearest_weights(p, a, b, c, weights):
+def nearest_weights(p, a, b, c):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
-    d1, d2 = _dot(a, b, p, a), _dot(a, c, p, a)
-    weights[:] = 0.0
+    to_b, to_c = minus(b, a), minus(c, a)
+    way = minus(p, a)
+    d1, d2 = dot(to_b, way), dot(to_c, way)
     if d1 <= 0.0 and d2 <= 0.0:
-        weights[0] = 1.0
-        return
-    d3, d4 = _dot(a, b, p, b), _dot(a, c, p, b)
+        return 1.0, 0.0, 0.0
+    way = minus(p, b)
+    d3, d4 = dot(to_b, way), dot(to_c, way)
     if d3 >= 0.0 and d4 <= d3:
-        weights[1] = 1.0
-        return
-    d5, d6 = _dot(a, b, p, c), _dot(a, c, p, c)
+        return 0.0, 1.0, 0.0
+    way = minus(p, c)
+    d5, d6 = dot(to_b, way), dot(to_c, way)
     if d6 >= 0.0 and d5 <= d6:
-        weights[2] = 1.0
-        return
+        return 0.0, 0.0, 1.0
     vc = d1 * d4 - d3 * d2
     vb = d5 * d2 - d1 * d6
     va = d3 * d6 - d5 * d4
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
-        weights[1] = d1 / (d1 - d3)
-        weights[0] = 1.0 - weights[1]
-    elif vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
-        weights[2] = d2 / (d2 - d6)
-        weights[0] = 1.0 - weights[2]
-    elif va <= 0.0 and d4 >= d3 and d5 >= d6:
-        weights[2] = (d4 - d3) / ((d4 - d3) + (d5 - d6))
-        weights[1] = 1.0 - weights[2]
-    else:
-        # The whole is zero on a triangle without area, all of which its edges hold.
-        whole = max(va + vb + vc, 1e-300)
-        weights[1], weights[2] = vb / whole, vc / whole
-        weights[0] = 1.0 - weights[1] - weights[2]
+        share = d1 / (d1 - d3)
+        return 1.0 - share, share, 0.0
+    if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+        share = d2 / (d2 - d6)
+        return 1.0 - share, 0.0, share
+    if va <= 0.0 and d4 >= d3 and d5 >= d6:
+        share = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+        return 0.0, 1.0 - share, share
+    # The whole is zero on a triangle without area, all of which its edges hold.
+    whole = max(va + vb + vc, 1e-300)
+    at_b, at_c = vb / whole, vc / whole
+    return 1.0 - at_b - at_c, at_b, at_c
 
 
 # Triangles in a leaf, at most.
@@ -284,23 +216,36 @@ class ExactDistance:
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         self.vertices, self.faces = vertices, faces
         self.layout = _layout(vertices, faces) if layout is None else layout
-        self.order = self.layout.order
-        self.starts = self.layout.starts
-        self.across = self.layout.across
-        self.records = np.empty((len(faces), WIDTH))
-        self.boxes = np.empty((2 * len(self.starts) - 2, 6))
-        fill_records(vertices, faces, self.order, self.records)
-        _box_loop(vertices, faces, self.order, self.starts, self.boxes)
+        order, starts, _ = self.layout
+        #: The arrays that :func:`nearest_triangle` takes.
+        self.tree = Tree(
+            np.empty((2 * len(starts) - 2, 6)), starts, np.empty((len(faces), WIDTH)), order
+        )
+        _record_loop(vertices, faces, order, self.tree.records)
+        _box_loop(vertices, faces, order, starts, self.tree.boxes)
 
     @cached_property
     def pseudonormals(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pseudonormals of the faces' edges (m, 3, 3) and of the vertices (n, 3)."""
-        return pseudonormals(self.vertices, self.faces, self.across)
+        """Directions that sign a distance, of the faces' edges (m, 3, 3) and of vertices (n, 3).
 
-    @property
-    def tree(self) -> Tree:
-        """The arrays that :func:`nearest_triangle` takes."""
-        return Tree(self.boxes, self.starts, self.records, self.order)
+        Edge k of a face takes the sum of the unit normals of the face and of that across it, if
+        there is one; a vertex takes the normals weighted by their angle. Faces without area have no
+        normal.
+        """
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        u, v = b - a, c - a
+        normal = np.cross(u, v)
+        area = np.sqrt(np.einsum("md,md->m", normal, normal))
+        sized = area[:, None] > 0.0
+        unit = np.divide(normal, area[:, None], out=np.zeros_like(normal), where=sized)
+        at_a = np.arctan2(area, np.einsum("md,md->m", u, v))
+        at_b = np.arctan2(area, -np.einsum("md,md->m", u, v - u))
+        angles = np.column_stack([at_a, at_b, np.pi - at_a - at_b])
+        of_vertices = np.zeros((len(self.vertices), 3))
+        np.add.at(of_vertices, self.faces, angles[:, :, None] * unit[:, None])
+        across = self.layout.across
+        other = np.where((across >= 0)[:, :, None], unit[across], 0.0)
+        return unit[:, None] + other, of_vertices
 
     def signed_distance(self, points: ArrayLike, *, reach: float = np.inf) -> NDArray[np.float64]:
         """Signed distance (n,) of points (n, 3) [unit of the mesh], negative inside.
@@ -325,7 +270,7 @@ class ExactDistance:
         count = len(points)
         distance, closest = np.empty(count), np.empty((count, 3))
         face, normal = np.empty(count, dtype=np.int64), np.empty((count, 3))
-        normals = (*self.pseudonormals, self.faces, self.order)
+        normals = (*self.pseudonormals, self.faces, self.tree.order)
 
         def work(a, b):
             out = (distance[a:b], closest[a:b], face[a:b], normal[a:b])
@@ -427,7 +372,8 @@ def _box_loop(vertices, faces, order, starts, boxes):
 
 
 @loop
-def _box_square(boxes, node, x, y, z):
+def box_square(boxes, node, x, y, z):
+    """Squared distance from a point to the box of a node."""
     dx = max(boxes[node, 0] - x, x - boxes[node, 3], 0.0)
     dy = max(boxes[node, 1] - y, y - boxes[node, 4], 0.0)
     dz = max(boxes[node, 2] - z, z - boxes[node, 5], 0.0)
@@ -437,13 +383,20 @@ def _box_square(boxes, node, x, y, z):
 @loop
 def record_square(records, n, x, y, z):
     """Squared distance from a point to the triangle of record n."""
-    qx = x - records[n, 0]
-    qy = y - records[n, 1]
-    qz = z - records[n, 2]
-    u = qx * records[n, 3] + qy * records[n, 4] + qz * records[n, 5]
-    v = qx * records[n, 6] + qy * records[n, 7] + qz * records[n, 8]
-    w = qx * records[n, 9] + qy * records[n, 10] + qz * records[n, 11]
-    du, dv, _ = nearest_in_frame(
+    _, (du, dv, w), _ = offset_in_frame(records, n, x, y, z)
+    return du * du + dv * dv + w * w
+
+
+@loop
+def offset_in_frame(records, n, x, y, z):
+    """Place of a point in the frame of the triangle of record n, in its plane; the way to the point
+    from the nearest place of the triangle; and the feature that this lies in.
+    """
+    away = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = dot(away, (records[n, 3], records[n, 4], records[n, 5]))
+    v = dot(away, (records[n, 6], records[n, 7], records[n, 8]))
+    w = dot(away, (records[n, 9], records[n, 10], records[n, 11]))
+    du, dv, feature = nearest_in_frame(
         records[n, BX],
         records[n, CX],
         records[n, CY],
@@ -452,7 +405,7 @@ def record_square(records, n, x, y, z):
         u,
         v,
     )
-    return du * du + dv * dv + w * w
+    return (u, v), (du, dv, w), feature
 
 
 @loop
@@ -469,15 +422,15 @@ def nearest_triangle(tree, at, best, square, slack, stack):
     nodes, squares = stack
     leaves = len(starts) - 1
     top = 0
-    nodes[0], squares[0] = 1, _box_square(boxes, 1, x, y, z)
+    nodes[0], squares[0] = 1, box_square(boxes, 1, x, y, z)
     while top >= 0:
         node = nodes[top]
         top -= 1
         if squares[top + 1] > square * (1.0 + slack):
             continue
         while node < leaves:
-            left = _box_square(boxes, 2 * node, x, y, z)
-            right = _box_square(boxes, 2 * node + 1, x, y, z)
+            left = box_square(boxes, 2 * node, x, y, z)
+            right = box_square(boxes, 2 * node + 1, x, y, z)
             node = 2 * node
             far, other = right, node + 1
             if right < left:
@@ -523,52 +476,28 @@ def _nearest_loop(points, reach, tree, normals, out):
             for k in range(3):
                 closest[i, k], normal[i, k] = points[i, k], 0.0
             continue
+        (u, v), (du, dv, _), feature = offset_in_frame(records, best, x, y, z)
+        outward = feature_normal(normals, records, best, feature)
         face[i] = order[best]
-        side = signed_side(records[best], order[best], points[i], normals, closest[i], normal[i])
+        side = 0.0
+        for k in range(3):
+            closest[i, k] = (
+                records[best, k] + (u - du) * records[best, 3 + k] + (v - dv) * records[best, 6 + k]
+            )
+            normal[i, k] = outward[k]
+            side += (points[i, k] - closest[i, k]) * outward[k]
         distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
 
 
 @loop
-def signed_side(record, face, point, normals, closest, normal):
-    """Fill the nearest point of a triangle and its pseudonormal; return the offset's part along it.
-
-    ``normals`` holds the edge normals, the vertex normals, the faces and their order.
+def feature_normal(normals, records, n, feature):
+    """The direction that signs the distance to a feature of the triangle of record n; ``normals``
+    are those of the edges and vertices, the faces, and the face of each record.
     """
-    edge_normals, vertex_normals, faces, _ = normals
-    feature = closest_in_record(record, point, closest)
-    _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal)
-    side = 0.0
-    for k in range(3):
-        side += (point[k] - closest[k]) * normal[k]
-    return side
-
-
-@loop
-def closest_in_record(record, point, closest):
-    """Fill the point of one triangle that is nearest to a point; return its feature."""
-    u = 0.0
-    v = 0.0
-    w = 0.0
-    for k in range(3):
-        u += (point[k] - record[k]) * record[3 + k]
-        v += (point[k] - record[k]) * record[6 + k]
-        w += (point[k] - record[k]) * record[9 + k]
-    du, dv, feature = nearest_in_frame(
-        record[BX], record[CX], record[CY], record[INVERSE_BC], record[INVERSE_CA], u, v
-    )
-    for k in range(3):
-        closest[k] = record[k] + (u - du) * record[3 + k] + (v - dv) * record[6 + k]
-    return feature
-
-
-@loop
-def _pseudonormal(record, feature, face, edge_normals, vertex_normals, faces, normal):
-    """Fill the direction that signs the distance to one feature of a face."""
-    first = int(record[FIRST])
-    for k in range(3):
-        if feature == FACE:
-            normal[k] = record[9 + k]
-        elif feature < CORNER:
-            normal[k] = edge_normals[face, (first + feature - EDGE) % 3, k]
-        else:
-            normal[k] = vertex_normals[faces[face, (first + feature - CORNER) % 3], k]
+    edge_normals, vertex_normals, faces, order = normals
+    first = int(records[n, FIRST])
+    if feature == FACE:
+        return records[n, 9], records[n, 10], records[n, 11]
+    if feature < CORNER:
+        return row_of(edge_normals[order[n]], (first + feature - EDGE) % 3)
+    return row_of(vertex_normals, faces[order[n], (first + feature - CORNER) % 3])

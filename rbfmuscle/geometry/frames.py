@@ -1,5 +1,5 @@
-"""Rotations as unit quaternions (w, x, y, z), for compiled loops; boxes, and coordinates of a rest
-mesh that stay the same wherever its scene lies.
+"""Vectors of three numbers and rotations as unit quaternions (w, x, y, z), for compiled loops;
+boxes, and coordinates of a rest mesh that stay the same wherever its scene lies.
 """
 
 import numpy as np
@@ -76,6 +76,30 @@ def dot(u, v):
 def cross(u, v):
     """Vector product of two vectors of three numbers."""
     return u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+
+
+@loop
+def minus(u, v):
+    """Difference of two vectors of three numbers."""
+    return u[0] - v[0], u[1] - v[1], u[2] - v[2]
+
+
+@loop
+def plus(u, v):
+    """Sum of two vectors of three numbers."""
+    return u[0] + v[0], u[1] + v[1], u[2] + v[2]
+
+
+@loop
+def divided(u, number):
+    """A vector of three numbers, divided by a number."""
+    return u[0] / number, u[1] / number, u[2] / number
+
+
+@loop
+def row_of(rows, k):
+    """Row k of an array (n, 3), as three numbers."""
+    return rows[k, 0], rows[k, 1], rows[k, 2]
 
 
 @loop

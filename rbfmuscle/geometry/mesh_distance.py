@@ -15,10 +15,12 @@ from rbfmuscle.geometry.exact_distance import (
     STACK,
     ExactDistance,
     Layout,
-    closest_in_record,
     nearest_triangle,
+    offset_in_frame,
     record_square,
 )
+from rbfmuscle.geometry.frames import cross, dot, row_of
+from rbfmuscle.geometry.surfaces import corner_from
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
 
@@ -84,41 +86,27 @@ def inside_test(
 def winding_loop(vertices, faces, points, out):
     """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a
     tree.
-
-    Van Oosterom & Strackee 1983, "The solid angle of a plane triangle".
     """
-    a = np.empty(3)
-    b = np.empty(3)
-    c = np.empty(3)
     for q in range(len(points)):
-        total = 0.0
+        at, total = row_of(points, q), 0.0
         for f in range(len(faces)):
-            aa = 0.0
-            bb = 0.0
-            cc = 0.0
-            ab = 0.0
-            bc = 0.0
-            ca = 0.0
-            for k in range(3):
-                a[k] = vertices[faces[f, 0], k] - points[q, k]
-                b[k] = vertices[faces[f, 1], k] - points[q, k]
-                c[k] = vertices[faces[f, 2], k] - points[q, k]
-                aa += a[k] * a[k]
-                bb += b[k] * b[k]
-                cc += c[k] * c[k]
-                ab += a[k] * b[k]
-                bc += b[k] * c[k]
-                ca += c[k] * a[k]
-            x = np.sqrt(aa)
-            y = np.sqrt(bb)
-            z = np.sqrt(cc)
-            volume = (
-                a[0] * (b[1] * c[2] - b[2] * c[1])
-                + a[1] * (b[2] * c[0] - b[0] * c[2])
-                + a[2] * (b[0] * c[1] - b[1] * c[0])
-            )
-            total += np.arctan2(volume, x * y * z + ab * z + bc * x + ca * y)
+            a = corner_from(vertices, faces[f, 0], at)
+            b = corner_from(vertices, faces[f, 1], at)
+            c = corner_from(vertices, faces[f, 2], at)
+            total += half_solid_angle(a, b, c)
         out[q] = total / (2.0 * np.pi)
+
+
+@loop
+def half_solid_angle(a, b, c):
+    """Half the solid angle of a triangle as seen from the origin (Van Oosterom & Strackee 1983,
+    "The solid angle of a plane triangle").
+    """
+    x = np.sqrt(dot(a, a))
+    y = np.sqrt(dot(b, b))
+    z = np.sqrt(dot(c, c))
+    below = x * y * z + dot(a, b) * z + dot(b, c) * x + dot(c, a) * y
+    return np.arctan2(dot(a, cross(b, c)), below)
 
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
@@ -372,7 +360,7 @@ class MeshDistance:
         near = np.full(len(points), -1) if near is None else near
         distance, side = self.unsigned(points, near=near), np.zeros(len(points))
         if simple:
-            _side_loop(points, self._exact.records, near, side)
+            _side_loop(points, self._exact.tree.records, near, side)
         unsure = side == 0.0
         side[unsure] = np.where(self.inside(points[unsure]), -1.0, 1.0)
         return side * distance
@@ -415,11 +403,8 @@ def _side_loop(points, records, near, side):
     """1 before and -1 behind the triangle nearest to each point, where it projects into that
     triangle.
     """
-    closest = np.empty(3)
     for i in range(len(points)):
-        record = records[near[i]]
-        if closest_in_record(record, points[i], closest) == FACE:
-            before = 0.0
-            for k in range(3):
-                before += (points[i, k] - record[k]) * record[9 + k]
+        x, y, z = row_of(points, i)
+        _, (_, _, before), feature = offset_in_frame(records, near[i], x, y, z)
+        if feature == FACE:
             side[i] = 1.0 if before >= 0.0 else -1.0

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
+from rbfmuscle.geometry.frames import cross, dot, minus, row_of
+from rbfmuscle.geometry.surfaces import triangle_plane
 from rbfmuscle.loops import loop
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
@@ -108,10 +110,8 @@ def _length(vertices, faces, f):
     square = 0.0
     for k in range(3):
         one, other = faces[f, k], faces[f, (k + 1) % 3]
-        side = 0.0
-        for a in range(3):
-            side += (vertices[one, a] - vertices[other, a]) ** 2
-        square = max(square, side)
+        side = minus(row_of(vertices, one), row_of(vertices, other))
+        square = max(square, dot(side, side))
     return np.sqrt(square)
 
 
@@ -147,7 +147,7 @@ def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pa
             end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
         if not inside:
             continue
-        plane = _plane(corners, corner, 0)
+        plane = triangle_plane(corners, corner, 0)
         square = _square(plane)
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
@@ -200,10 +200,9 @@ def _push_loop(vertices, faces, points, first, near, edge, allowed, moved):
         if depth <= ASKED * allowed[p] or depth >= deepest:
             continue
         pushed = True
-        plane = _plane(vertices, faces, best)
+        plane = triangle_plane(vertices, faces, best)
         square = _square(plane)
         at_b, at_c = _areas(plane, points[p, 0], points[p, 1], points[p, 2])
-        (nx, ny, nz) = plane[3]
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # What is allowed is left: what is a little deeper does not leap.
         way = (depth - allowed[p]) / (weight[0] ** 2 + weight[1] ** 2 + weight[2] ** 2)
@@ -211,9 +210,8 @@ def _push_loop(vertices, faces, points, first, near, edge, allowed, moved):
         for k in range(3):
             v = faces[best, k]
             moved[v] = True
-            vertices[v, 0] -= nx * way * weight[k]
-            vertices[v, 1] -= ny * way * weight[k]
-            vertices[v, 2] -= nz * way * weight[k]
+            for a in range(3):
+                vertices[v, a] -= plane[3][a] * way * weight[k]
     return pushed
 
 
@@ -229,7 +227,7 @@ def _triangle_over(vertices, faces, point, near):
     least = np.inf
     signed = 0.0
     for f in near:
-        plane = _plane(vertices, faces, f)
+        plane = triangle_plane(vertices, faces, f)
         square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
         if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
             continue  # beside it
@@ -243,49 +241,20 @@ def _triangle_over(vertices, faces, point, near):
 
 
 @loop
-def _plane(vertices, faces, f):
-    """Corner A of a triangle, its sides to B and C, and its normal, as long as twice its area."""
-    a = faces[f, 0]
-    b = faces[f, 1]
-    c = faces[f, 2]
-    ax = vertices[a, 0]
-    ay = vertices[a, 1]
-    az = vertices[a, 2]
-    ux = vertices[b, 0] - ax
-    uy = vertices[b, 1] - ay
-    uz = vertices[b, 2] - az
-    vx = vertices[c, 0] - ax
-    vy = vertices[c, 1] - ay
-    vz = vertices[c, 2] - az
-    return (
-        (ax, ay, az),
-        (ux, uy, uz),
-        (vx, vy, vz),
-        (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx),
-    )
-
-
-@loop
 def _square(plane):
     """Square of the normal's length."""
-    nx, ny, nz = plane[3]
-    return nx * nx + ny * ny + nz * nz
+    return dot(plane[3], plane[3])
 
 
 @loop
 def _height(plane, x, y, z):
     """Height of a point above a triangle, times the normal's length."""
-    (ax, ay, az), (nx, ny, nz) = plane[0], plane[3]
-    return nx * (x - ax) + ny * (y - ay) + nz * (z - az)
+    return dot(plane[3], minus((x, y, z), plane[0]))
 
 
 @loop
 def _areas(plane, x, y, z):
     """Areas at B and C of a point's foot on a triangle's plane, times twice the normal's length."""
-    (ax, ay, az), (ux, uy, uz), (vx, vy, vz), (nx, ny, nz) = plane
-    px = x - ax
-    py = y - ay
-    pz = z - az
-    at_b = nx * (py * vz - pz * vy) + ny * (pz * vx - px * vz) + nz * (px * vy - py * vx)
-    at_c = nx * (uy * pz - uz * py) + ny * (uz * px - ux * pz) + nz * (ux * py - uy * px)
-    return at_b, at_c
+    corner, to_b, to_c, normal = plane
+    way = minus((x, y, z), corner)
+    return dot(normal, cross(way, to_c)), dot(normal, cross(to_b, way))

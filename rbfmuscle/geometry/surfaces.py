@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.frames import cross, dot, minus, row_of
 from rbfmuscle.loops import loop
 
 if TYPE_CHECKING:
@@ -37,18 +38,24 @@ def vertex_normals(vertices: Floats, faces: Integers) -> Floats:
 @loop
 def _vertex_normal_loop(vertices, faces, normals):
     for f in range(len(faces)):
-        a = vertices[faces[f, 0]]
-        b = vertices[faces[f, 1]]
-        c = vertices[faces[f, 2]]
-        for k in range(3):
-            i, j = (k + 1) % 3, (k + 2) % 3
-            area = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
-            for corner in range(3):
-                normals[faces[f, corner], k] += area
+        normal = triangle_plane(vertices, faces, f)[3]
+        for corner in range(3):
+            for k in range(3):
+                normals[faces[f, corner], k] += normal[k]
     for v in range(len(normals)):
-        length = np.sqrt(normals[v, 0] ** 2 + normals[v, 1] ** 2 + normals[v, 2] ** 2)
+        total = row_of(normals, v)
+        length = max(np.sqrt(dot(total, total)), 1e-300)
         for k in range(3):
-            normals[v, k] /= max(length, 1e-300)
+            normals[v, k] /= length
+
+
+@loop
+def triangle_plane(vertices, faces, f):
+    """Corner A of a triangle, its sides to B and C, and its normal, twice its area long."""
+    a = row_of(vertices, faces[f, 0])
+    to_b = corner_from(vertices, faces[f, 1], a)
+    to_c = corner_from(vertices, faces[f, 2], a)
+    return a, to_b, to_c, cross(to_b, to_c)
 
 
 def unique_edges(faces: Integers) -> Integers:
@@ -192,17 +199,13 @@ def six_volumes(p, q, r):
     """Six times the signed volume of the tetrahedron of the origin and three points: r . (p x
     q).
     """
-    return (
-        (p[1] * q[2] - p[2] * q[1]) * r[0]
-        + (p[2] * q[0] - p[0] * q[2]) * r[1]
-        + (p[0] * q[1] - p[1] * q[0]) * r[2]
-    )
+    return dot(cross(p, q), r)
 
 
 @loop
 def corner_from(vertices, v, origin):
     """Vertex v relative to an origin, as three numbers."""
-    return vertices[v, 0] - origin[0], vertices[v, 1] - origin[1], vertices[v, 2] - origin[2]
+    return minus(row_of(vertices, v), origin)
 
 
 @loop
@@ -210,7 +213,7 @@ def volume_loop(vertices, faces):
     """Enclosed volume, measured from a corner of the first face; 0 without faces."""
     if len(faces) == 0:
         return 0.0
-    total, origin = 0.0, corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
+    total, origin = 0.0, row_of(vertices, faces[0, 0])
     for f in range(len(faces)):
         p = corner_from(vertices, faces[f, 0], origin)
         q = corner_from(vertices, faces[f, 1], origin)
@@ -223,27 +226,16 @@ def volume_loop(vertices, faces):
 def volume_rate(vertices, faces, direction):
     """The volume of a closed mesh, and how fast it grows along directions d (n, 3)."""
     volume, rate = 0.0, 0.0
-    origin = corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
+    origin = row_of(vertices, faces[0, 0])
     for f in range(len(faces)):
-        i = faces[f, 0]
-        j = faces[f, 1]
-        k = faces[f, 2]
-        p = corner_from(vertices, i, origin)
-        q = corner_from(vertices, j, origin)
+        i, j, k = row_of(faces, f)
         r = corner_from(vertices, k, origin)
-        x = p[0] - r[0]
-        y = p[1] - r[1]
-        z = p[2] - r[2]
-        u = q[0] - r[0]
-        v = q[1] - r[1]
-        w = q[2] - r[2]
-        a = y * w - z * v
-        b = z * u - x * w
-        c = x * v - y * u
-        volume += a * r[0] + b * r[1] + c * r[2]
-        rate += a * (direction[i, 0] + direction[j, 0] + direction[k, 0])
-        rate += b * (direction[i, 1] + direction[j, 1] + direction[k, 1])
-        rate += c * (direction[i, 2] + direction[j, 2] + direction[k, 2])
+        p = minus(corner_from(vertices, i, origin), r)
+        q = minus(corner_from(vertices, j, origin), r)
+        normal = cross(p, q)
+        volume += dot(normal, r)
+        for a in range(3):
+            rate += normal[a] * (direction[i, a] + direction[j, a] + direction[k, a])
     return volume / 6.0, rate / 6.0
 
 
@@ -258,14 +250,12 @@ def volume_cubic(vertices, faces, direction):
     c1 = 0.0
     c2 = 0.0
     c3 = 0.0
-    origin = corner_from(vertices, faces[0, 0], (0.0, 0.0, 0.0))
+    origin = row_of(vertices, faces[0, 0])
     for f in range(len(faces)):
-        i = faces[f, 0]
-        j = faces[f, 1]
-        k = faces[f, 2]
-        at = vertices[i, 0], vertices[i, 1], vertices[i, 2]
-        p = at[0] - origin[0], at[1] - origin[1], at[2] - origin[2]
-        u = direction[i, 0], direction[i, 1], direction[i, 2]
+        i, j, k = row_of(faces, f)
+        at = row_of(vertices, i)
+        p = minus(at, origin)
+        u = row_of(direction, i)
         total = (
             u[0] + direction[j, 0] + direction[k, 0],
             u[1] + direction[j, 1] + direction[k, 1],
@@ -282,22 +272,41 @@ def volume_cubic(vertices, faces, direction):
     return c0 / 6.0, c1 / 6.0, c2 / 12.0, c3 / 18.0
 
 
+def change_to_volume(
+    vertices: Floats, faces: Integers, direction: Floats, volume: float, steps: int
+) -> float:
+    """How far along directions d (n, 3) a closed mesh has a volume, by so many Newton steps of the
+    cubic polynomial; NaN where the volume does not grow along them.
+    """
+    c0, c1, c2, c3 = volume_cubic(vertices, faces, direction)
+    change = 0.0
+    for _ in range(steps):
+        lack = volume - (c0 + change * (c1 + change * (c2 + change * c3)))
+        if lack == 0.0:
+            break
+        rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
+        if not rate > 0.0:
+            return np.nan
+        change += lack / rate
+    return change
+
+
 @loop
 def touching_balls(points, normals, steps, nearest):
     """Radii ``steps`` (2, n) of the empty balls that touch each point from outside and inside,
     infinite where no point limits them, and how far the nearest other point is.
     """
     for i in range(len(points)):
+        at = row_of(points, i)
+        normal = row_of(normals, i)
         steps[:, i] = np.inf
         least = np.inf
         for j in range(len(points)):
-            square, along = 0.0, 0.0
-            for c in range(3):
-                d = points[j, c] - points[i, c]
-                square += d * d
-                along += d * normals[i, c]
             if j == i:
                 continue
+            way = corner_from(points, j, at)
+            square = dot(way, way)
+            along = dot(way, normal)
             least = min(least, square)
             side = 0 if along > 0 else 1
             if along != 0.0:
@@ -354,9 +363,8 @@ def farthest_move(before, after):
     """How far a point (n, 3) moved at most; infinity where one is not finite."""
     most = 0.0
     for i in range(len(before)):
-        square = 0.0
-        for a in range(3):
-            square += (after[i, a] - before[i, a]) ** 2
+        way = minus(row_of(after, i), row_of(before, i))
+        square = dot(way, way)
         if not square <= most:
             most = square if np.isfinite(square) else np.inf
     return np.sqrt(most)

@@ -171,6 +171,4 @@ def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LE
     # Several pieces a thread, as pieces differ in cost.
     pieces = min(4 * workers, count // least)
     limits = [count * k // pieces for k in range(pieces + 1)]
-    futures = [_pool(workers).submit(work, a, b) for a, b in pairwise(limits)]
-    for future in futures:
-        future.result()
+    each(lambda piece: work(*piece), list(pairwise(limits)))

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.mesh_distance import ClipDistance, Field
 from rbfmuscle.geometry.point_grid import Obstacles, push_off
-from rbfmuscle.geometry.surfaces import label_sheets, mesh_volume, volume_cubic
+from rbfmuscle.geometry.surfaces import change_to_volume, label_sheets, mesh_volume
 from rbfmuscle.validation import check_finite, check_points, check_positive
 
 # More nodes than this are refused; so many are evaluated at a time.
@@ -316,18 +316,9 @@ class Projector:
         """Change of level that brings the mesh to a volume, a cubic polynomial of the change, by
         Newton steps.
         """
-        c0, c1, c2, c3 = volume_cubic(self.vertices, faces, self._direction)
-        change = 0.0
-        for _ in range(steps):
-            lack = target - (c0 + change * (c1 + change * (c2 + change * c3)))
-            if lack == 0.0:
-                break
-            rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
-            if not rate > 0:
-                raise ValueError(
-                    f"no level gives a volume of {target:g}: the cut leaves no surface"
-                )
-            change += lack / rate
+        change = change_to_volume(self.vertices, faces, self._direction, target, steps)
+        if np.isnan(change):
+            raise ValueError(f"no level gives a volume of {target:g}: the cut leaves no surface")
         return change
 
     def push_off(self, faces: Integers, obstacles: Obstacles) -> None:

@@ -20,6 +20,7 @@ from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import morton_order
 from rbfmuscle.geometry.exact_distance import nearest_weights
+from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
     face_normals,
@@ -568,24 +569,26 @@ def _nearest_in_cell_loop(vertices, faces, corner, target, points, face, distanc
     """Point nearest to target[k] of the triangles wholly in cell k: at a thin rim two would else
     take the same.
     """
-    q, share = np.empty(3), np.empty(3)
     for f in range(len(faces)):
         k = corner[f, 0]
         if corner[f, 1] != k or corner[f, 2] != k:
             continue
-        a = vertices[faces[f, 0]]
-        b = vertices[faces[f, 1]]
-        d = vertices[faces[f, 2]]
-        nearest_weights(target[k], a, b, d, share)
-        square = 0.0
-        for c in range(3):
-            q[c] = a[c] + share[1] * (b[c] - a[c]) + share[2] * (d[c] - a[c])
-            square += (target[k, c] - q[c]) ** 2
-        if square < distance[k]:
-            distance[k] = square
+        a = row_of(vertices, faces[f, 0])
+        b = row_of(vertices, faces[f, 1])
+        c = row_of(vertices, faces[f, 2])
+        at = row_of(target, k)
+        _, second, third = nearest_weights(at, a, b, c)
+        found = (
+            a[0] + second * (b[0] - a[0]) + third * (c[0] - a[0]),
+            a[1] + second * (b[1] - a[1]) + third * (c[1] - a[1]),
+            a[2] + second * (b[2] - a[2]) + third * (c[2] - a[2]),
+        )
+        way = minus(at, found)
+        if dot(way, way) < distance[k]:
+            distance[k] = dot(way, way)
             face[k] = f
-            for c in range(3):
-                points[k, c] = q[c]
+            for axis in range(3):
+                points[k, axis] = found[axis]
 
 
 # Part of the names under which samples are kept: raise it when the way to find them changes.

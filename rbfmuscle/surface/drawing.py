@@ -186,13 +186,14 @@ class SurfaceBuilder:
         of them.
         """
         if self._bones is None or self._bones[0] is not contacts:
-            met = ShownBones(self.shown, contacts, self._grids)
+            at_rest = np.tile(np.eye(4), (len(contacts.placed), 1, 1))
+            resting = ShownBones(self.shown, contacts.bones, at_rest, self._grids)
             nearest = cKDTree(self.rest.points).query(self.shown.rest)[1]
             kept = (self.rest.held_by >= 0) | contacts.keeps_overlap
-            cleared = clear_rest(self.shown, met.at_rest(), kept[nearest])
+            cleared = clear_rest(self.shown, resting, kept[nearest])
             if not np.array_equal(cleared, self.shown.rest):
                 self._take(cleared, self.shown.faces)
-                met = ShownBones(self.shown, contacts, self._grids)
+            met = ShownBones(self.shown, contacts.bones, contacts.placed, self._grids)
             self._bones = contacts, met
         return self._bones[1]
 

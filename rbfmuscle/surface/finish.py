@@ -16,9 +16,14 @@ from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, unit
 from rbfmuscle.geometry.crossing import cross
-from rbfmuscle.geometry.surfaces import face_normals, vertex_normals, volume_rate
+from rbfmuscle.geometry.surfaces import (
+    change_to_volume,
+    face_normals,
+    vertex_normals,
+    volume_rate,
+)
 from rbfmuscle.loops import loop
-from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones, level_change
+from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones
 
 # Rounds, at most; where triangles still cross after PARTED of them, in a tangle without sides, they
 # are smoothed as they were, and a ring more of them in each of so many rounds.
@@ -189,6 +194,8 @@ def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smooth
 # Bones, crossings and volume are met up to so many times, as the way back to the volume can make
 # triangles cross.
 AGAIN = 3
+# Newton steps of the cubic polynomial of the volume.
+CUBIC = 4
 # Times that the volume is met after what its step drove into a bone was brought out.
 MEET = 4
 # Steps by which the material is blown up to its volume, and the step, in mean edges, whose last
@@ -228,11 +235,12 @@ def fill(shown: Shown, bones: ShownBones, sheet: Sheet) -> float:
     """
     total = 0.0
     for turn in range(MEET + 1):
-        change = level_change(shown, sheet)
+        given = sheet.vertices, shown.faces, sheet.direction, shown.volume, CUBIC
+        change = change_to_volume(*given)
         if np.isnan(change):
             sheet.direction[:] = vertex_normals(sheet.vertices, shown.faces)
             bones.lift(sheet)
-            change = level_change(shown, sheet)
+            change = change_to_volume(*given)
         if np.isnan(change):
             return change
         total += change

@@ -8,17 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
+from rbfmuscle.bones.distance import BoneArrays, Memory, distances
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.point_grid import PointGrid, push_off
-from rbfmuscle.geometry.surfaces import vertex_normals, volume_cubic
-from rbfmuscle.geometry.threads import in_chunks
+from rbfmuscle.geometry.surfaces import vertex_normals
 from rbfmuscle.implicit.evaluation import Blend
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import BonesInReach
 
-# Newton steps of the cubic polynomial of the volume.
-CUBIC = 4
 # Rings of vertices on which a displacement fades, by so much on each.
 RINGS, FADE = 3, 0.6
 
@@ -96,23 +93,6 @@ class Sheet(NamedTuple):
         self.direction[rows] = 0.0
 
 
-def level_change(shown: Shown, sheet: Sheet) -> float:
-    """Change of the level that brings a surface to its volume, a cubic polynomial of the change;
-    NaN where none does.
-    """
-    c0, c1, c2, c3 = volume_cubic(sheet.vertices, shown.faces, sheet.direction)
-    change = 0.0
-    for _ in range(CUBIC):
-        lack = shown.volume - (c0 + change * (c1 + change * (c2 + change * c3)))
-        if lack == 0.0:
-            break
-        rate = c1 + change * (2.0 * c2 + change * 3.0 * c3)
-        if not rate > 0.0:
-            return np.nan
-        change += lack / rate
-    return change
-
-
 # No point of a triangle is farther from a corner than its longest side over root 3, and a bone's
 # vertex behind it, which pushes it, no deeper than a third of that side; in longest sides, which
 # may stretch by a fifth.
@@ -127,14 +107,15 @@ LIFTS = 2  # rounds of moving what lies in a bone onto it, at most
 class ShownBones:
     """The bones in reach of a shown surface, and what is known of their distances.
 
-    ``grids`` are those of the bones' vertices, by name. What is known changes no result.
+    ``poses`` (r, 4, 4) are those of the bones, which may change in place, ``grids`` those of their
+    vertices, by name. What is known changes no result.
     """
 
     def __init__(
-        self, shown: Shown, contacts: BoneContacts, grids: Mapping[str, PointGrid]
+        self, shown: Shown, bones: BonesInReach, poses: Floats, grids: Mapping[str, PointGrid]
     ) -> None:
-        bones = contacts.bones
-        self._shown, self._poses = shown, contacts.placed
+        self._shown = shown
+        self._poses = poses
         self._bones: list[BoneArrays] = [field.arrays for field in bones.fields]
         self._grids = [grids[name] for name in bones.names]
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
@@ -143,15 +124,6 @@ class ShownBones:
         nothing = np.zeros(0, dtype=np.int64)
         self._near = [nothing for _ in bones.names]
         self._known = [Memory.of(0) for _ in bones.names]
-
-    def at_rest(self) -> "ShownBones":
-        """The same bones where they are at rest, with nothing known."""
-        other = object.__new__(ShownBones)
-        other.__dict__.update(self.__dict__)
-        other._poses = np.tile(np.eye(4), (len(self._poses), 1, 1))
-        other._memories = [Memory.of(len(self._shown.rest)) for _ in self._bones]
-        other._near, other._known = list(self._near), list(self._known)
-        return other
 
     def find_near(self, points: Floats) -> None:
         """Find the vertices that a bone may be within reach of, where these are at points (n, 3).
@@ -176,15 +148,7 @@ class ShownBones:
         """Distances (k,) of points (k, 3) to one bone and the directions (k, 3) in which they grow;
         beyond ``reach`` (k,) lower bounds, without a direction.
         """
-        distance, direction = np.empty(len(points)), np.empty((len(points), 3))
-
-        def work(start: int, stop: int) -> None:
-            given = self._bones[bone], self._poses[bone], points[start:stop], reach[start:stop]
-            memory = [part[start:stop] for part in known]
-            distance_loop(*given, *memory, distance[start:stop], direction[start:stop])
-
-        in_chunks(len(points), work)
-        return distance, direction
+        return distances(self._bones[bone], self._poses[bone], points, reach, known)
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.

@@ -55,12 +55,12 @@ def test_a_closed_mesh_is_taken_as_it_is():
     """Two boxes, of which one's corner is where the other's is."""
     one = trimesh.creation.box((2.0, 2.0, 2.0))
     both = trimesh.util.concatenate([one, one.copy().apply_translation([2.0, 2.0, 2.0])])
-    taken = prepare_bone(both.vertices, both.faces)
-    np.testing.assert_array_equal(taken.faces, both.faces)
-    assert taken.closed and taken.notes == []
-    turned = prepare_bone(both.vertices, both.faces[:, ::-1])
-    np.testing.assert_array_equal(turned.faces, both.faces)
-    assert turned.notes == ["faces pointed inward and were turned"]
+    taken, closed, notes = prepare_bone(both.vertices, both.faces)
+    np.testing.assert_array_equal(taken, both.faces)
+    assert closed and notes == []
+    turned, _, notes = prepare_bone(both.vertices, both.faces[:, ::-1])
+    np.testing.assert_array_equal(turned, both.faces)
+    assert notes == ["faces pointed inward and were turned"]
 
 
 def _crossed(ball, away):

@@ -50,7 +50,7 @@ class TestInterrupts:
         ("number", "moment", "due", "lost"),
         [
             ("SIGINT", "builtins.__import__", "given[0] == 'cyclopts'", ""),
-            ("SIGTERM", "pbd_baseline.muscle._bone_numbers", "True", ""),
+            ("SIGTERM", "pbd_baseline.muscle.attachment_frames", "True", ""),
             ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", ""),
             # As ctypes does in a callback.
             ("SIGINT", "rbfmuscle.run.writer.write_vtp", "len(calls) == 8", "KeyboardInterrupt"),

@@ -5,7 +5,7 @@ it.
 import numpy as np
 import trimesh
 
-from pbd_baseline.settling import MeshSettling, MovingSurface, Sweeps
+from pbd_baseline.settling import MeshSettling, MovingSurface
 from rbfmuscle.geometry.interpolation import Embedding
 
 
@@ -57,7 +57,7 @@ def test_forces_at_contacts_move_vertices_as_a_dense_matrix_of_them_does():
     rng = np.random.default_rng(8)
     points, mass = rng.normal(size=(9, 3)), rng.uniform(0.5, 2.0, 9)
     mass[3] = 0.0  # held
-    moving = MeshSettling(points, mass, 1.0, Sweeps(lambda number: None, 5, 0.0), None)
+    moving = MeshSettling(points, mass, 1.0, lambda number: None, most=5)
     at, columns = np.array([2, 3]), np.array([[0, 1, 2], [5, 3, 7], [8, 0, 4]])
     shares = rng.dirichlet(np.ones(3), 3)
     normal, force = rng.normal(size=(5, 3)), rng.normal(size=5)

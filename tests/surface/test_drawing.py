@@ -130,12 +130,12 @@ def test_a_surface_that_turns_and_is_mirrored_turns_and_is_mirrored():
 def test_what_a_bone_holds_is_brought_out_of_it_at_rest():
     drawn = Drawn([bone(0.5, 1.2, 0.0, 0.0)])
     held = X[:, 1] > -10.0
-    found = clear_rest(drawn.shown, drawn.bones.at_rest(), held)
+    found = clear_rest(drawn.shown, drawn.bones, held)
     assert drawn.distance(X).min() < -0.2 and drawn.distance(found).min() > -1e-3
     assert not crossing_faces(found, FACES).any()
     far = drawn.distance(X) > 0.3
     np.testing.assert_allclose(found[far], X[far], rtol=0, atol=1e-15)
-    same = clear_rest(drawn.shown, drawn.bones.at_rest(), ~held)
+    same = clear_rest(drawn.shown, drawn.bones, ~held)
     np.testing.assert_array_equal(same, X)
     depth = np.maximum(-drawn.distance(X), 0.0).max()
     assert np.linalg.norm(found - X, axis=1).max() < 1.1 * depth
