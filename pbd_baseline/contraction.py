@@ -6,6 +6,7 @@ import numpy as np
 
 from pbd_baseline.rest import RestState
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.activation import make_contraction
 from rbfmuscle.scene.objects import Muscle
@@ -110,10 +111,8 @@ def _wanted_loop(points, measured, band, wanted):
     stretch = np.full(len(points), 1e-9)
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
-        square = 0.0
-        for k in range(3):
-            square += (points[i, k] - points[j, k]) ** 2
-        ratio = per_length[c] * np.sqrt(square)
+        apart = minus(row_of(points, i), row_of(points, j))
+        ratio = per_length[c] * np.sqrt(dot(apart, apart))
         stretch[i] += ratio
         stretch[j] += ratio
     for i in range(len(points)):

@@ -16,7 +16,7 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.exact_distance import nearest_weights
 from rbfmuscle.geometry.frames import cross, divided, dot, minus, plus, row_of
 from rbfmuscle.geometry.interpolation import Embedding
-from rbfmuscle.geometry.mesh_distance import winding_loop
+from rbfmuscle.geometry.mesh_distance import HERE, Columns
 from rbfmuscle.geometry.surfaces import farthest_move, touching_balls, vertex_normals
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.touching import NOTHING, Wanted
@@ -90,9 +90,8 @@ class MovingSurface:
         # A folded triangle at a rim may give a point far outside a large depth.
         deep = np.flatnonzero(distance < -FOLDED * self.edge)
         if len(deep):
-            winding = np.empty(len(deep))
-            winding_loop(self.vertices, self.faces, points[deep], winding)
-            distance[deep[winding < 0.5]] = np.inf
+            inside = Columns(self.vertices, self.faces).inside(points[deep], HERE)
+            distance[deep[~inside]] = np.inf
         return distance
 
 

@@ -214,6 +214,8 @@ class Shape:
     """
 
     volume_in_sweeps = True
+    #: Rotations (n, 4) of neighbourhoods that are remembered from sweep to sweep, of ARAP models.
+    quaternions: Floats | None = None
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         self.volume = rest.volume
@@ -233,14 +235,18 @@ class Shape:
         self.volume.restore(points, self._swelling(points), contact.planes)
 
     def transform(self, motion: np.ndarray) -> None:
-        """Go along with a rigid motion (4, 4)."""
+        """The rotations go along with a rigid motion (4, 4)."""
+        if self.quaternions is not None:
+            self.quaternions[:] = turned_quaternions(self.quaternions, motion[:3, :3])
 
     def snapshot(self) -> np.ndarray | None:
-        """What the shape remembers from sweep to sweep; None where that is nothing."""
-        return None
+        """The rotations; None where there are none."""
+        return None if self.quaternions is None else self.quaternions.copy()
 
     def restore(self, state: Floats | None) -> None:
-        """Go back to a snapshot."""
+        """Go back to the rotations of a snapshot."""
+        if self.quaternions is not None:
+            self.quaternions[:] = state
 
     def _swelling(self, points: np.ndarray) -> np.ndarray:
         """Direction (n, 3) in which the muscle swells: along the normals, as far as there is
@@ -341,33 +347,13 @@ class XPBDShape(Shape):
         self.edges.project(points)
 
 
-class RotatingShape(Shape):
-    """A shape whose neighbourhoods have rotations (`ARAP`), which it remembers from sweep to
-    sweep.
-    """
-
-    def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
-        super().__init__(rest, options, stiffer)
-        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
-
-    def transform(self, motion: np.ndarray) -> None:
-        """The rotations go along with a rigid motion (4, 4)."""
-        self.arap.quaternions[:] = turned_quaternions(self.arap.quaternions, motion[:3, :3])
-
-    def snapshot(self) -> np.ndarray:
-        """The rotations."""
-        return self.arap.quaternions.copy()
-
-    def restore(self, state: Floats | None) -> None:
-        """Go back to the rotations of a snapshot."""
-        self.arap.quaternions[:] = state
-
-
-class ARAPShape(RotatingShape):
+class ARAPShape(Shape):
     """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
+        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
+        self.quaternions = self.arap.quaternions
         self.constraint = ARAPConstraint(self.arap, rest.inverse_mass)
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
@@ -381,7 +367,7 @@ class ARAPShape(RotatingShape):
         self.constraint.project(points, time=time)
 
 
-class GlobalARAPShape(RotatingShape):
+class GlobalARAPShape(Shape):
     """Local rotations and one prefactored global solve: the ARAP of the paper's second option.
 
     The global step makes E(x) + |x - z|^2 / (2 l^2) least in the surface's own measure, z where
@@ -392,6 +378,8 @@ class GlobalARAPShape(RotatingShape):
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
+        self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
+        self.quaternions = self.arap.quaternions
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
         reach = STEP_REACH * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))

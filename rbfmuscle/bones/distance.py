@@ -25,6 +25,7 @@ from rbfmuscle.geometry.exact_distance import (
     offset_in_frame,
     record_square,
 )
+from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.mesh_distance import half_solid_angle
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
@@ -246,12 +247,10 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
     stack = np.empty(STACK, np.int64)
     squares = np.empty(STACK)
     for i in range(len(points)):
-        dx = points[i, 0] - pose[0, 3]
-        dy = points[i, 1] - pose[1, 3]
-        dz = points[i, 2] - pose[2, 3]
-        x = pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz
-        y = pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz
-        z = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+        way = minus(row_of(points, i), (pose[0, 3], pose[1, 3], pose[2, 3]))
+        x = dot((pose[0, 0], pose[1, 0], pose[2, 0]), way)
+        y = dot((pose[0, 1], pose[1, 1], pose[2, 1]), way)
+        z = dot((pose[0, 2], pose[1, 2], pose[2, 2]), way)
         beyond = box_square(bone.boxes, 1, x, y, z)
         moved = (x - anchor[i, 0]) ** 2 + (y - anchor[i, 1]) ** 2 + (z - anchor[i, 2]) ** 2
         least = bound[i] - np.sqrt(moved)
@@ -259,9 +258,7 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
             least = max(least, np.sqrt(beyond))
         if least > reach[i]:
             distance[i] = least
-            gradient[i, 0] = 0.0
-            gradient[i, 1] = 0.0
-            gradient[i, 2] = 0.0
+            gradient[i] = 0.0
             continue
         d, gx, gy, gz, best = distance_at(bone, x, y, z, triangle[i], stack, squares)
         distance[i] = d

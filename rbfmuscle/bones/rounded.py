@@ -15,7 +15,7 @@ import numpy as np
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.frames import RestFrame, box_corners
+from rbfmuscle.geometry.frames import RestFrame, box_corners, dot, minus, row_of
 from rbfmuscle.geometry.interpolation import bspline_sum
 from rbfmuscle.loops import loop
 
@@ -137,12 +137,10 @@ def rounded_at(rounded, x, y, z, least):
     axes = rounded.axes
     table = rounded.table
     low = rounded.low
-    dx = x - rounded.origin[0]
-    dy = y - rounded.origin[1]
-    dz = z - rounded.origin[2]
-    u = (axes[0, 0] * dx + axes[0, 1] * dy + axes[0, 2] * dz) / rounded.edge
-    v = (axes[1, 0] * dx + axes[1, 1] * dy + axes[1, 2] * dz) / rounded.edge
-    w = (axes[2, 0] * dx + axes[2, 1] * dy + axes[2, 2] * dz) / rounded.edge
+    way = minus((x, y, z), rounded.origin)
+    u = dot(row_of(axes, 0), way) / rounded.edge
+    v = dot(row_of(axes, 1), way) / rounded.edge
+    w = dot(row_of(axes, 2), way) / rounded.edge
     i = np.int64(np.floor(u))
     j = np.int64(np.floor(v))
     k = np.int64(np.floor(w))

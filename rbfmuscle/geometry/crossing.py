@@ -152,10 +152,9 @@ def _boxes_loop(vertices, faces, face, node, wanted, whole):
                 low = np.inf
                 high = -np.inf
                 if f < len(faces):
-                    x = vertices[faces[f, 0], a]
-                    y = vertices[faces[f, 1], a]
-                    z = vertices[faces[f, 2], a]
-                    low, high = min(x, y, z), max(x, y, z)
+                    i, j, k = row_of(faces, f)
+                    low = min(vertices[i, a], vertices[j, a], vertices[k, a])
+                    high = max(vertices[i, a], vertices[j, a], vertices[k, a])
                 face[leaf, a, place] = low
                 face[leaf, 3 + a, place] = high
                 least, most = min(least, low), max(most, high)

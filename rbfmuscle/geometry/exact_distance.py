@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import cross, divided, dot, minus, row_of
 from rbfmuscle.geometry.surfaces import corner_from, opposite_half_edges
 from rbfmuscle.geometry.threads import in_chunks
@@ -267,17 +268,26 @@ class ExactDistance:
         points = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not reach > 0.0:
             raise ValueError(f"reach must be above zero, got {reach}")
-        count = len(points)
-        distance, closest = np.empty(count), np.empty((count, 3))
-        face, normal = np.empty(count, dtype=np.int64), np.empty((count, 3))
+        near = np.full(len(points), -1)
+        distance = self.unsigned(points, near, reach)
+        closest, normal = np.empty_like(points), np.empty_like(points)
         normals = (*self.pseudonormals, self.faces, self.tree.order)
+        _side_loop(points, self.tree, normals, near, distance, closest, normal)
+        return distance, closest, np.where(near < 0, -1, self.tree.order[near]), normal
 
-        def work(a, b):
-            out = (distance[a:b], closest[a:b], face[a:b], normal[a:b])
-            _nearest_loop(points[a:b], float(reach), self.tree, normals, out)
+    def unsigned(self, points: Floats, near: Integers, reach: float = np.inf) -> Floats:
+        """Distance (n,) of points (n, 3), at most ``reach``.
 
-        in_chunks(count, work)
-        return distance, closest, face, normal
+        ``near`` (n,) holds the record of a triangle near each point, -1 where none is known;
+        afterwards that of the nearest one, -1 beyond the reach.
+        """
+        distance = np.empty(len(points))
+
+        def work(a: int, b: int) -> None:
+            nearest_loop(points[a:b], float(reach), self.tree, near[a:b], distance[a:b])
+
+        in_chunks(len(points), work)
+        return distance
 
 
 def _layout(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Layout:
@@ -453,40 +463,47 @@ def nearest_triangle(tree, at, best, square, slack, stack):
 
 
 @loop
-def _nearest_loop(points, reach, tree, normals, out):
-    records, order = tree.records, tree.order
-    distance, closest, face, normal = out
+def nearest_loop(points, reach, tree, near, distance):
+    """Fill the records of the triangles nearest to points (n, 3), -1 beyond ``reach``, and their
+    distances (n,), at most the reach. A record that is in ``near`` (n,) already is where the search
+    begins.
+    """
     stack = np.empty(STACK, np.int64), np.empty(STACK)
     best = np.int64(-1)
     for i in range(len(points)):
-        x = points[i, 0]
-        y = points[i, 1]
-        z = points[i, 2]
+        x, y, z = row_of(points, i)
+        # The last answer bounds the next one where points come in order.
+        best = near[i] if near[i] >= 0 else best
         square = reach * reach
         if best >= 0:
-            # The last answer bounds the next one where points come in order.
-            d = record_square(records, best, x, y, z)
-            if d < square:
-                square = d
-            else:
-                best = -1
+            known = record_square(tree.records, best, x, y, z)
+            best = best if known < square else np.int64(-1)
+            square = min(known, square)
         best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
-        if best < 0:
-            distance[i], face[i] = reach, -1
-            for k in range(3):
-                closest[i, k], normal[i, k] = points[i, k], 0.0
+        near[i] = best
+        distance[i] = np.sqrt(square) if best >= 0 else reach
+
+
+@loop
+def _side_loop(points, tree, normals, near, distance, closest, normal):
+    """Give distances (n,) their signs, and fill the nearest points and pseudonormals (n, 3)."""
+    closest[:] = points
+    normal[:] = 0.0
+    for i in range(len(points)):
+        n = near[i]
+        if n < 0:
             continue
-        (u, v), (du, dv, _), feature = offset_in_frame(records, best, x, y, z)
-        outward = feature_normal(normals, records, best, feature)
-        face[i] = order[best]
+        x, y, z = row_of(points, i)
+        (u, v), (du, dv, _), feature = offset_in_frame(tree.records, n, x, y, z)
+        outward = feature_normal(normals, tree.records, n, feature)
         side = 0.0
         for k in range(3):
-            closest[i, k] = (
-                records[best, k] + (u - du) * records[best, 3 + k] + (v - dv) * records[best, 6 + k]
-            )
+            record = tree.records[n]
+            closest[i, k] = record[k] + (u - du) * record[3 + k] + (v - dv) * record[6 + k]
             normal[i, k] = outward[k]
             side += (points[i, k] - closest[i, k]) * outward[k]
-        distance[i] = np.sqrt(square) if side >= 0.0 else -np.sqrt(square)
+        if side < 0.0:
+            distance[i] = -distance[i]
 
 
 @loop

@@ -7,7 +7,7 @@ import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
-from rbfmuscle.geometry.frames import matrix_quaternion
+from rbfmuscle.geometry.frames import cross, dot, matrix_quaternion, row_of
 from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.loops import loop
 
@@ -112,16 +112,10 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
 def exponential_loop(points, twists, out):
     """Move each point by the exponential of its twist (omega, velocity)."""
     for n in range(len(points)):
-        x = points[n, 0]
-        y = points[n, 1]
-        z = points[n, 2]
-        a = twists[n, 0]
-        b = twists[n, 1]
-        c = twists[n, 2]
-        u = twists[n, 3]
-        v = twists[n, 4]
-        w = twists[n, 5]
-        square = a * a + b * b + c * c
+        point = row_of(points, n)
+        omega = twists[n, 0], twists[n, 1], twists[n, 2]
+        velocity = twists[n, 3], twists[n, 4], twists[n, 5]
+        square = dot(omega, omega)
         angle = np.sqrt(square)
         if angle < 1e-6:  # further terms are below rounding
             first, second, third = 1.0, 0.5, 1.0 / 6.0
@@ -129,16 +123,12 @@ def exponential_loop(points, twists, out):
             first, half = np.sin(angle) / angle, np.sin(0.5 * angle) / angle
             second = 2.0 * half * half
             third = (1.0 - first) / square
-        # omega x point and omega x velocity, and omega x these.
-        px = b * z - c * y
-        py = c * x - a * z
-        pz = a * y - b * x
-        sx = b * w - c * v
-        sy = c * u - a * w
-        sz = a * v - b * u
-        out[n, 0] = x + u + first * px + second * (b * pz - c * py + sx) + third * (b * sz - c * sy)
-        out[n, 1] = y + v + first * py + second * (c * px - a * pz + sy) + third * (c * sx - a * sz)
-        out[n, 2] = z + w + first * pz + second * (a * py - b * px + sz) + third * (a * sy - b * sx)
+        turned, swept = cross(omega, point), cross(omega, velocity)
+        twice, swept_twice = cross(omega, turned), cross(omega, swept)
+        for a in range(3):
+            out[n, a] = point[a] + velocity[a] + first * turned[a]
+            out[n, a] += second * (twice[a] + swept[a])
+            out[n, a] += third * swept_twice[a]
 
 
 @loop
@@ -146,25 +136,16 @@ def logarithm_loop(motions, twists):
     """Twists (omega, velocity) of rigid motions (b, 4, 4)."""
     for n in range(len(motions)):
         w, a, b, c = matrix_quaternion(motions[n])
-        sine = np.sqrt(a * a + b * b + c * c)
+        sine = np.sqrt(dot((a, b, c), (a, b, c)))
         half = np.arctan2(sine, abs(w))
         share = np.copysign(2.0 * half / sine if sine > 1e-8 else 2.0, w)
         third = 1.0 / 12.0 + half * half / 180.0
         if half > 5e-5:
             third = (0.25 - 0.25 * half * abs(w) / sine) / (half * half)
-        a = share * a
-        b = share * b
-        c = share * c
-        x = motions[n, 0, 3]
-        y = motions[n, 1, 3]
-        z = motions[n, 2, 3]
-        # omega x shift, and omega x that.
-        px = b * z - c * y
-        py = c * x - a * z
-        pz = a * y - b * x
-        twists[n, 0] = a
-        twists[n, 1] = b
-        twists[n, 2] = c
-        twists[n, 3] = x - 0.5 * px + third * (b * pz - c * py)
-        twists[n, 4] = y - 0.5 * py + third * (c * px - a * pz)
-        twists[n, 5] = z - 0.5 * pz + third * (a * py - b * px)
+        omega = share * a, share * b, share * c
+        shift = motions[n, 0, 3], motions[n, 1, 3], motions[n, 2, 3]
+        turned = cross(omega, shift)
+        twice = cross(omega, turned)
+        for k in range(3):
+            twists[n, k] = omega[k]
+            twists[n, 3 + k] = shift[k] - 0.5 * turned[k] + third * twice[k]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers, unit
+from rbfmuscle.geometry.frames import dot, row_of
 from rbfmuscle.loops import loop
 
 # Vertices around a tube, where nothing else is asked for.
@@ -111,14 +112,12 @@ def _profile_loop(points, turn, shift, size, width, found):
     """
     count = 0
     for i in range(len(points)):
-        a = points[i, 0]
-        b = points[i, 1]
-        c = points[i, 2]
-        x = turn[0, 0] * a + turn[0, 1] * b + turn[0, 2] * c + shift[0]
+        point = row_of(points, i)
+        x = dot(row_of(turn, 0), point) + shift[0]
         if x <= 0.0 or x >= size:
             continue
-        y = turn[1, 0] * a + turn[1, 1] * b + turn[1, 2] * c + shift[1]
-        z = turn[2, 0] * a + turn[2, 1] * b + turn[2, 2] * c + shift[2]
+        y = dot(row_of(turn, 1), point) + shift[1]
+        z = dot(row_of(turn, 2), point) + shift[2]
         y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
         if y > 0.0:
             found[count, 0], found[count, 1] = x, y

@@ -10,18 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
-from rbfmuscle.geometry.exact_distance import (
-    FACE,
-    STACK,
-    ExactDistance,
-    Layout,
-    nearest_triangle,
-    offset_in_frame,
-    record_square,
-)
+from rbfmuscle.geometry.exact_distance import FACE, ExactDistance, Layout, offset_in_frame
 from rbfmuscle.geometry.frames import cross, dot, row_of
-from rbfmuscle.geometry.surfaces import corner_from
-from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
 
 
@@ -35,23 +25,10 @@ class Field(Protocol):
         """Values (n,) and gradients (n, 3) at points (n, 3)."""
 
 
-class ClipDistance(Protocol):
-    """What cuts a surface: a signed distance, negative inside, that need not be exact far away.
-
-    No value changes by more than one for each unit of way, so that answers bound those nearby.
-    """
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Values (n,) at points (n, 3); a lower bound where they are farther than a surface
-        comes.
-        """
-
-    def value_and_gradient_below(
-        self, points: np.ndarray, limit: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (n,) and gradients (n, 3), only lower bounds where a value is beyond its limit
-        (n,).
-        """
+# Of points (n, 3) and a limit, a number or (n,): signed distances (n,) to what cuts a surface,
+# negative inside it, and their gradients (n, 3). Beyond the limit these are only lower bounds above
+# it. No distance changes by more than one for each unit of way, so that answers bound those nearby.
+Cut = Callable[[Floats, Floats | float], tuple[Floats, Floats]]
 
 
 def winding_numbers(vertices: Floats, faces: Integers) -> Callable[[Floats], Floats]:
@@ -83,21 +60,6 @@ def inside_test(
 
 
 @loop
-def winding_loop(vertices, faces, points, out):
-    """Winding numbers (n,) of a few points by the sum over all triangles' solid angles, without a
-    tree.
-    """
-    for q in range(len(points)):
-        at, total = row_of(points, q), 0.0
-        for f in range(len(faces)):
-            a = corner_from(vertices, faces[f, 0], at)
-            b = corner_from(vertices, faces[f, 1], at)
-            c = corner_from(vertices, faces[f, 2], at)
-            total += half_solid_angle(a, b, c)
-        out[q] = total / (2.0 * np.pi)
-
-
-@loop
 def half_solid_angle(a, b, c):
     """Half the solid angle of a triangle as seen from the origin (Van Oosterom & Strackee 1983,
     "The solid angle of a plane triangle").
@@ -111,7 +73,7 @@ def half_solid_angle(a, b, c):
 
 # Cells along the longer side, at most; below that the square root of the number of triangles.
 _MOST_CELLS = 512
-_HERE = np.eye(4)
+HERE = np.eye(4)
 
 
 class _Grid(NamedTuple):
@@ -122,7 +84,7 @@ class _Grid(NamedTuple):
     along x.
     """
 
-    axes: NDArray[np.int64]
+    axes: tuple[int, int, int]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     fine: float
@@ -147,7 +109,7 @@ class Columns:
         # Column by column, which takes a tenth of the time of all at once.
         low, high = (np.array([end(column) for column in vertices.T]) for end in (np.min, np.max))
         along = int(np.argmin(high - low))
-        axes = np.array([(along + 1) % 3, (along + 2) % 3, along])  # a right-handed turn of x, y, z
+        axes = (along + 1) % 3, (along + 2) % 3, along  # a right-handed turn of x, y, z
         cells = min(max(int(len(faces) ** 0.5), 1), _MOST_CELLS)
         fine = cells / max(float((high - low).max()), 1e-300)
         width, height = (int((high[k] - low[k]) * fine) + 1 for k in axes[:2])
@@ -172,28 +134,20 @@ def _count_loop(vertices, faces, grid, covered):
     """Cells that each triangle's box covers, by column and row, and in ``starts`` how many
     triangles each cell has.
     """
-    u = grid.axes[0]
-    v = grid.axes[1]
-    w = grid.axes[2]
+    u, v, w = grid.axes
     x = grid.low[u]
     y = grid.low[v]
     fine = grid.fine
     for f in range(len(faces)):
-        a = faces[f, 0]
-        b = faces[f, 1]
-        c = faces[f, 2]
-        left = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
-        right = int((max(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
-        near = int((min(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
-        far = int((max(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        a, b, c = row_of(faces, f)
+        covered[f, 0] = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        covered[f, 1] = int((max(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
+        covered[f, 2] = int((min(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
+        covered[f, 3] = int((max(vertices[a, v], vertices[b, v], vertices[c, v]) - y) * fine)
         bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
         top = max(vertices[a, w], vertices[b, w], vertices[c, w])
-        covered[f, 0] = left
-        covered[f, 1] = right
-        covered[f, 2] = near
-        covered[f, 3] = far
-        for j in range(near, far + 1):
-            for cell in range(j * grid.width + left, j * grid.width + right + 1):
+        for j in range(covered[f, 2], covered[f, 3] + 1):
+            for cell in range(j * grid.width + covered[f, 0], j * grid.width + covered[f, 1] + 1):
                 grid.starts[cell] += 1
                 grid.ends[cell, 0] = min(grid.ends[cell, 0], bottom)
                 grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
@@ -214,14 +168,10 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
     low = grid.low
     high = grid.high
     fine = grid.fine
-    u = grid.axes[0]
-    v = grid.axes[1]
-    w = grid.axes[2]
+    u, v, w = grid.axes
     at = np.empty(3)
     for n in range(len(points)):
-        x = points[n, 0]
-        y = points[n, 1]
-        z = points[n, 2]
+        x, y, z = row_of(points, n)
         outside = False
         for k in range(3):
             at[k] = pose[k, 0] * x + pose[k, 1] * y + pose[k, 2] * z + pose[k, 3]
@@ -327,7 +277,7 @@ class MeshDistance:
         """For the same faces at a later moment; None before the first distance."""
         return self._exact.layout if "_exact" in self.__dict__ else self._known_layout
 
-    def inside(self, points: ArrayLike, *, pose: Floats = _HERE) -> Booleans:
+    def inside(self, points: ArrayLike, *, pose: Floats = HERE) -> Booleans:
         """Which points (n, 3) lie inside, (n,), once a pose (4, 4) has carried them into the mesh's
         coordinates.
         """
@@ -340,13 +290,7 @@ class MeshDistance:
         known; afterwards that of the nearest one, for the next call with a mesh of the same layout.
         """
         points = _as_points(points)
-        out, near = np.empty(len(points)), np.full(len(points), -1) if near is None else near
-
-        def work(first: int, last: int) -> None:
-            _distance_loop(points[first:last], self._exact.tree, near[first:last], out[first:last])
-
-        in_chunks(len(points), work)
-        return out
+        return self._exact.unsigned(points, np.full(len(points), -1) if near is None else near)
 
     def signed(
         self, points: ArrayLike, *, near: Integers | None = None, simple: bool = False
@@ -372,7 +316,7 @@ class MeshDistance:
         distance, closest, _, normal = self._exact.nearest(points)
         return distance, closest, normal
 
-    def depth(self, points: ArrayLike, *, pose: Floats = _HERE) -> Floats:
+    def depth(self, points: ArrayLike, *, pose: Floats = HERE) -> Floats:
         """How deep points (n, 3) lie inside, (n,) [scene unit], 0 where outside; the pose is as for
         `inside`.
         """
@@ -381,21 +325,6 @@ class MeshDistance:
         if inside.any():
             out[inside] = self.unsigned(to_world(points[inside], pose))
         return out
-
-
-@loop
-def _distance_loop(points, tree, near, out):
-    stack = np.empty(STACK, np.int64), np.empty(STACK)
-    best = np.int64(-1)
-    for i in range(len(points)):
-        x = points[i, 0]
-        y = points[i, 1]
-        z = points[i, 2]
-        # The last answer bounds the next one where points come in order.
-        best = near[i] if near[i] >= 0 else best
-        square = np.inf if best < 0 else record_square(tree.records, best, x, y, z)
-        best, square = nearest_triangle(tree, (x, y, z), best, square, 0.0, stack)
-        near[i], out[i] = best, np.sqrt(square)
 
 
 @loop

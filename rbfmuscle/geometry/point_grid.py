@@ -8,7 +8,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
 from rbfmuscle.geometry.frames import cross, dot, minus, row_of
-from rbfmuscle.geometry.surfaces import triangle_plane
+from rbfmuscle.geometry.surfaces import corner_from, triangle_plane
 from rbfmuscle.loops import loop
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
@@ -82,8 +82,7 @@ def push_off(
     """
     if among is None:
         among = np.ones(len(vertices), dtype=np.bool_)
-    cells = grid.points, grid.start, grid.low, grid.edge, grid.shape
-    given = vertices, faces, among, pose, *cells
+    given = vertices, faces, among, pose, grid
     pairs = np.empty((len(faces), 2), dtype=np.int64)
     met = _near_loop(*given, pairs)
     if met > len(pairs):
@@ -116,10 +115,12 @@ def _length(vertices, faces, f):
 
 
 @loop
-def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pairs):
+def _near_loop(vertices, faces, among, pose, grid, pairs):
     """Pairs of a point and a triangle with a corner in ``among`` (n,) near it; how many there are,
     also beyond what ``pairs`` (k, 2) holds.
     """
+    points, start, low, edge, shape, _ = grid
+    shift = pose[0, 3], pose[1, 3], pose[2, 3]
     corners, corner = np.empty((3, 3)), np.arange(3).reshape(1, 3)
     least, most = np.empty(3), np.empty(3)
     begin = np.empty(3, np.int64)
@@ -129,33 +130,26 @@ def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pa
         if not (among[faces[f, 0]] or among[faces[f, 1]] or among[faces[f, 2]]):
             continue
         for k in range(3):
-            v = faces[f, k]
-            x = vertices[v, 0] - pose[0, 3]
-            y = vertices[v, 1] - pose[1, 3]
-            z = vertices[v, 2] - pose[2, 3]
+            way = corner_from(vertices, faces[f, k], shift)
             for a in range(3):
-                corners[k, a] = x * pose[0, a] + y * pose[1, a] + z * pose[2, a]
+                corners[k, a] = dot(way, (pose[0, a], pose[1, a], pose[2, a]))
         margin = MARGIN * _length(corners, corner, 0)
         inside = True
         for a in range(3):
-            x = corners[0, a]
-            y = corners[1, a]
-            z = corners[2, a]
-            least[a], most[a] = min(x, y, z) - margin, max(x, y, z) + margin
+            least[a] = min(corners[0, a], corners[1, a], corners[2, a]) - margin
+            most[a] = max(corners[0, a], corners[1, a], corners[2, a]) + margin
             inside &= most[a] >= low[a] and least[a] <= low[a] + edge * shape[a]
             begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
             end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
         if not inside:
             continue
         plane = triangle_plane(corners, corner, 0)
-        square = _square(plane)
+        square = dot(plane[3], plane[3])
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
-                    x = points[p, 0]
-                    y = points[p, 1]
-                    z = points[p, 2]
+                    x, y, z = row_of(points, p)
                     # Most are outside the box.
                     boxed = (
                         (least[0] <= x)
@@ -175,7 +169,7 @@ def _near_loop(vertices, faces, among, pose, points, start, low, edge, shape, pa
 @loop
 def _is_near(plane, square, margin, x, y, z):
     """Whether a point is within a margin of a triangle's plane, and not beside it."""
-    height = _height(plane, x, y, z)
+    height = dot(plane[3], minus((x, y, z), plane[0]))
     at_b, at_c = _areas(plane, x, y, z)
     over = height * height <= margin * margin * square
     return over and min(at_b, at_c, square - at_b - at_c) >= -BESIDE * square
@@ -189,7 +183,9 @@ def _push_loop(vertices, faces, points, first, near, edge, allowed, moved):
     """
     pushed = False
     for p in range(len(points)):
-        best, depth = _triangle_over(vertices, faces, points[p], near[first[p] : first[p + 1]])
+        best, depth = _triangle_over(
+            vertices, faces, row_of(points, p), near[first[p] : first[p + 1]]
+        )
         if best < 0:
             continue
         deepest = CHORD * min(_length(vertices, faces, best), edge)
@@ -201,7 +197,7 @@ def _push_loop(vertices, faces, points, first, near, edge, allowed, moved):
             continue
         pushed = True
         plane = triangle_plane(vertices, faces, best)
-        square = _square(plane)
+        square = dot(plane[3], plane[3])
         at_b, at_c = _areas(plane, points[p, 0], points[p, 1], points[p, 2])
         weight = 1.0 - (at_b + at_c) / square, at_b / square, at_c / square
         # What is allowed is left: what is a little deeper does not leap.
@@ -220,36 +216,22 @@ def _triangle_over(vertices, faces, point, near):
     """Of the triangles ``near`` a point the one whose plane is nearest, of those that it is not
     beside, -1 for none, and the point's depth below that.
     """
-    x = point[0]
-    y = point[1]
-    z = point[2]
+    x, y, z = point
     best = -1
     least = np.inf
     signed = 0.0
     for f in near:
         plane = triangle_plane(vertices, faces, f)
-        square, (at_b, at_c) = _square(plane), _areas(plane, x, y, z)
+        square, (at_b, at_c) = dot(plane[3], plane[3]), _areas(plane, x, y, z)
         if square == 0.0 or min(at_b, at_c, square - at_b - at_c) < -1e-9 * square:
             continue  # beside it
-        depth = -_height(plane, x, y, z) / np.sqrt(square)
+        depth = -dot(plane[3], minus((x, y, z), plane[0])) / np.sqrt(square)
         # Of triangles that are equally near, but for rounding, the first.
         if abs(depth) < least * (1.0 - 1e-6):
             best = f
             least = abs(depth)
             signed = depth
     return best, signed
-
-
-@loop
-def _square(plane):
-    """Square of the normal's length."""
-    return dot(plane[3], plane[3])
-
-
-@loop
-def _height(plane, x, y, z):
-    """Height of a point above a triangle, times the normal's length."""
-    return dot(plane[3], minus((x, y, z), plane[0]))
 
 
 @loop

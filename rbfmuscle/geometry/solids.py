@@ -7,7 +7,6 @@ joined; parts beside each other stay.
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,16 +24,6 @@ LEAST_OVERLAP = 1e-9
 INSIDE = 0.6
 # Volume below this share of area^1.5 (0.094 for a ball) gives a shell no outside.
 SHEET = 1e-3
-
-
-class OuterSurface(NamedTuple):
-    """Vertices (n, 3) and outward faces (m, 3) that bound a solid body, and what was done for
-    them.
-    """
-
-    vertices: Floats
-    faces: Integers
-    notes: list[str]
 
 
 class SolidDistance(MeshDistance):
@@ -58,8 +47,9 @@ class SolidDistance(MeshDistance):
         super().__init__(vertices, faces, closed=bool((faces_across(faces) >= 0).all()))
 
 
-def outer_surface(vertices: Floats, faces: Integers) -> OuterSurface:
-    """Return the boundary of the union of a mesh's shells.
+def outer_surface(vertices: Floats, faces: Integers) -> tuple[Floats, Integers, list[str]]:
+    """Return vertices (n, 3) and outward faces (m, 3) of the boundary of the union of a mesh's
+    shells, and what was done for it.
 
     Shells inside another are left out. Closed ones that go through each other are replaced by their
     union, whose vertices are put behind the given ones (n, 3); where they are open, faces inside
@@ -74,7 +64,7 @@ def outer_surface(vertices: Floats, faces: Integers) -> OuterSurface:
         faces = faces[~repeated_faces(faces)]
         number, _ = label_shells(faces)
     if number.max(initial=0) == 0:
-        return OuterSurface(vertices, given, [])
+        return vertices, given, []
     count = int(number.max()) + 1
     order = np.argsort(number, kind="stable")
     parts = [faces[k] for k in np.split(order, np.cumsum(np.bincount(number))[:-1])]
@@ -87,10 +77,13 @@ def outer_surface(vertices: Floats, faces: Integers) -> OuterSurface:
         nested = "nested shells" if len(outer) == 1 else "shells"
         notes.append(f"{count} {nested}, {ignored} ignored: the inside counts as solid")
     bounds = []
-    for group in _groups(outer):
-        vertices, joined = _join(vertices, [outer[k] for k in group], notes)
+    meet = np.array([[one.meets(other) for other in outer] for one in outer])
+    group = connected_components(meet, directed=False)[1]
+    for k in range(group.max() + 1):
+        members = [outer[m] for m in np.flatnonzero(group == k)]
+        vertices, joined = _join(vertices, members, notes)
         bounds.append(joined)
-    return OuterSurface(vertices, np.ascontiguousarray(np.concatenate(bounds)), notes)
+    return vertices, np.ascontiguousarray(np.concatenate(bounds)), notes
 
 
 def label_shells(faces: Integers) -> tuple[Integers, bool]:
@@ -148,13 +141,6 @@ class _Shell:
     def meets(self, other: "_Shell") -> bool:
         """Whether the boxes meet."""
         return bool((self.box[0] <= other.box[1]).all() and (other.box[0] <= self.box[1]).all())
-
-
-def _groups(shells: list[_Shell]) -> list[list[int]]:
-    """Numbers of shells, in groups whose boxes meet."""
-    meet = np.array([[one.meets(other) for other in shells] for one in shells])
-    group = connected_components(meet, directed=False)[1]
-    return [np.flatnonzero(group == k).tolist() for k in range(group.max() + 1)]
 
 
 def _join(vertices: Floats, shells: list[_Shell], notes: list[str]) -> tuple[Floats, Integers]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.mesh_distance import ClipDistance, Field
+from rbfmuscle.geometry.mesh_distance import Cut, Field
 from rbfmuscle.geometry.point_grid import Obstacles, push_off
 from rbfmuscle.geometry.surfaces import change_to_volume, label_sheets, mesh_volume
 from rbfmuscle.validation import check_finite, check_points, check_positive
@@ -27,8 +27,10 @@ LEAST_VALUE = 1e-6
 # Cells along the longest side of the points when stray sheets are looked for, and the share of it
 # added on every side.
 SEARCHED, MARGIN = 64, 0.075
-# A vertex farther than this from the cut, in cells, stays clear of it.
-NEAR_CUT = 1.2
+# Newton steps towards the zero set, at most.
+NEWTON = 6
+# A vertex farther than this from the cut, in cells, stays clear of it; how far it is asked for.
+NEAR_CUT, REACH = 1.2, 1.25
 
 
 @dataclass(frozen=True)
@@ -107,12 +109,14 @@ class LevelSet:
     inside.
     """
 
-    def __init__(self, grid: Grid, field: Field, clip_distance: ClipDistance | None = None) -> None:
+    def __init__(self, grid: Grid, field: Field, cut: Cut | None = None) -> None:
         self.grid = grid
         self.field = field
-        self.clip_distance = clip_distance
+        self.cut = cut
         self._f = grid.evaluate(field)
-        self._c = None if clip_distance is None else grid.evaluate(clip_distance)
+        self._c = None
+        if cut is not None:
+            self._c = grid.evaluate(lambda points: cut(points, REACH * grid.spacing)[0])
 
     def march(self, level: float) -> tuple[Floats, Integers]:
         """Vertices (n, 3) in grid coordinates and outward triangles (m, 3), if any, closed but on
@@ -208,7 +212,7 @@ def extract_surface(
     *,
     points: ArrayLike,
     resolution: int = 48,
-    clip_distance: ClipDistance | None = None,
+    cut: Cut | None = None,
     volume: float | None = None,
     level: float = 0.0,
     axes: ArrayLike | None = None,
@@ -219,12 +223,11 @@ def extract_surface(
 
     Predicted surface ``points`` (n, 3) [scene unit] give the grid, with ``resolution`` cells along
     the longest side of their box, and which sheet is the surface's. ``cut`` gives distances,
-    negative inside what is to be cut away; beyond 1.2 cells a lower bound of more than that will
-    do. The level is moved from ``level`` until the mesh has the ``volume``, if one is wanted, to
-    1e-9. Rows of ``axes`` (3, 3), a rotation, are the grid's axes: in a frame that moves with the
-    scene the mesh does too. ``obstacles`` are vertices of the bones behind ``cut``, each in its own
-    coordinates with its pose: triangles whose chords cut across a convex bone are moved until no
-    vertex is inside the mesh by more than 1 % of a cell.
+    negative inside what is to be cut away. The level is moved from ``level`` until the mesh has the
+    ``volume``, if one is wanted, to 1e-9. Rows of ``axes`` (3, 3), a rotation, are the grid's axes:
+    in a frame that moves with the scene the mesh does too. ``obstacles`` are vertices of the bones
+    behind ``cut``, each in its own coordinates with its pose: triangles whose chords cut across a
+    convex bone are moved until no vertex is inside the mesh by more than 1 % of a cell.
 
     ValueError on bad arguments, NaN in field or cut, an empty level set, or one that is not closed
     within twice the box of the points; on a volume that no level reaches.
@@ -236,9 +239,7 @@ def extract_surface(
     padding, most = 3, int(resolution) // 2
     while True:
         grid = Grid.around(points, resolution=resolution, padding=padding, axes=axes)
-        surface = _reach_volume(
-            LevelSet(grid, field, clip_distance), points, target, level, obstacles or []
-        )
+        surface = _reach_volume(LevelSet(grid, field, cut), points, target, level, obstacles or [])
         if surface is not None:
             return surface
         if padding >= most:
@@ -252,37 +253,34 @@ def extract_surface(
 class Projector:
     """Vertices (n, 3) on their way to the zero set of max(f - level, -d).
 
-    ``near_cut`` (n,) marks those that may lie on or come to the cut; ``spacing`` is the length of
-    cells. ``slope`` (n,) is 1 / |grad f|, 0 for vertices that stay when the level changes.
+    ``spacing`` is the length of cells. ``slope`` (n,) is 1 / |grad f|, 0 for vertices that stay
+    when the level changes.
     """
 
-    def __init__(
-        self,
-        field: Field,
-        clip_distance: ClipDistance | None,
-        vertices: Floats,
-        spacing: float,
-        near_cut: Booleans,
-    ) -> None:
-        self.vertices, self.spacing = vertices, spacing
-        self._field = field
-        self._clip_distance = clip_distance
-        self._near_cut = near_cut
+    def __init__(self, level_set: LevelSet, vertices: Floats) -> None:
+        self.vertices = vertices
+        self.spacing = level_set.grid.spacing
+        self._field = level_set.field
+        self._cut = level_set.cut
+        # Which vertices lie on the cut, or may come there by a shift by a cell.
+        self._near_cut = np.zeros(len(vertices), dtype=np.bool_)
+        if self._cut is not None:
+            distance, _ = self._cut(vertices, REACH * self.spacing)
+            self._near_cut = distance < NEAR_CUT * self.spacing
         self.slope = np.zeros(len(vertices))
         self._direction = np.zeros_like(vertices)
 
-    def project(self, level: float, *, rounds: int = 6) -> None:
+    def project(self, level: float) -> None:
         """Newton steps until they are shorter than 1e-4 of a cell."""
         todo = np.arange(len(self.vertices))
         on_field = np.ones(len(self.vertices), dtype=bool)
-        for _ in range(rounds):
+        for _ in range(NEWTON):
             f, gradient = self._field.value_and_gradient(self.vertices[todo])
             square = np.maximum(np.einsum("nd,nd->n", gradient, gradient), 2.3e-308)
             self.slope[todo] = 1.0 / np.sqrt(square)
             self._direction[todo] = gradient / square[:, None]
             step = (level - f)[:, None] * self._direction[todo]
-            if self._clip_distance is not None:
-                self._turn_to_cut(todo, (f - level) * self.slope[todo], step, on_field)
+            self._turn_to_cut(todo, (f - level) * self.slope[todo], step, on_field)
             length = np.sqrt(np.einsum("nd,nd->n", step, step))
             share = np.minimum(1.0, self.spacing / np.maximum(length, 1e-300))
             self.vertices[todo] += share[:, None] * step
@@ -299,10 +297,10 @@ class Projector:
         surface.
         """
         rows = np.flatnonzero(self._near_cut[todo])
-        if self._clip_distance is None or len(rows) == 0:
+        if self._cut is None or len(rows) == 0:
             return
         where = self.vertices[todo[rows]]
-        distance, outward = self._clip_distance.value_and_gradient_below(where, -height[rows])
+        distance, outward = self._cut(where, -height[rows])
         on_cut = height[rows] < -distance
         on_field[todo[rows]] = ~on_cut
         step[rows[on_cut]] = _way_out(distance[on_cut], outward[on_cut])
@@ -329,13 +327,11 @@ class Projector:
                 push_off(self.vertices, faces, grid, pose, self.spacing, moved)
             rows = np.flatnonzero(moved)
             self._hold(rows)
-            if self._clip_distance is None or len(rows) == 0:
+            if self._cut is None or len(rows) == 0:
                 break
             # What was pushed off one bone vertex must not end in the bone beside it.
             where = self.vertices[rows]
-            distance, outward = self._clip_distance.value_and_gradient_below(
-                where, np.zeros(len(rows))
-            )
+            distance, outward = self._cut(where, np.zeros(len(rows)))
             inside = distance < 0.0
             self.vertices[rows[inside]] += _way_out(distance[inside], outward[inside])
 
@@ -360,12 +356,7 @@ def _reach_volume(
         if found is None:
             return None
         vertices, faces, components = found
-        near_cut = np.zeros(
-            len(vertices), dtype=np.bool_
-        )  # what a shift by a cell may bring to the cut
-        if level_set.clip_distance is not None:
-            near_cut = np.asarray(level_set.clip_distance(vertices) < NEAR_CUT * spacing)
-        projector = Projector(level_set.field, level_set.clip_distance, vertices, spacing, near_cut)
+        projector = Projector(level_set, vertices)
         projector.project(level)
         step = 0.0 if target is None else projector.volume_step(faces, target)
         for _ in range(4):

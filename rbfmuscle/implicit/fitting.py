@@ -19,7 +19,6 @@ part, the rows of P that add nothing are left out.
 
 import math
 import warnings
-from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -164,15 +163,8 @@ _DEPENDENT = 1e-9  # norm of a polynomial beside the others, below which it depe
 _CHUNK, _SERIAL = 64, 16
 
 
-class Fits(NamedTuple):
-    """Solutions of P fits.
-
-    ``weights`` (P, size), ``coefficients`` (P, q) of the polynomials, and the ``condition`` (P,).
-    """
-
-    weights: np.ndarray
-    coefficients: np.ndarray
-    condition: np.ndarray
+# Weights (P, size), coefficients (P, q) of the polynomials, and the conditions (P,) of P fits.
+Fits = tuple[Floats, Floats, Floats]
 
 
 def solve(
@@ -191,28 +183,23 @@ def solve(
     with a NumericalWarning. LinAlgError if the system is singular (the message names the likely
     cause), or the bound is more than floating-point numbers hold.
     """
-    if math.isfinite(condition):
-        found = _solve_bounded(basis, right, smoothing, condition)
-        return found.weights, found.coefficients, min(float(found.condition.max()), condition)
-    first = _solve_all(basis, right, smoothing, math.inf)
-    if first is not None and first.condition.max() < DOUBTFUL:
-        return first.weights, first.coefficients, float(first.condition.max())
-    _raise_if_singular(basis)
-    found = _solve_bounded(basis, right, smoothing, KEPT)
-    _warn(basis)
-    return found.weights, found.coefficients, DOUBTFUL
-
-
-def _solve_bounded(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits:
-    """`_solve_all`, or the LinAlgError that says why not."""
+    bound = condition
     found = _solve_all(basis, right, smoothing, bound)
+    if math.isinf(condition) and (found is None or not found[2].max() < DOUBTFUL):
+        _raise_if_singular(basis)
+        bound = KEPT
+        found = _solve_all(basis, right, smoothing, bound)
     if found is None:
         _raise_if_singular(basis)
         message = (
             f"no Cholesky factor with a condition of {bound:g}; lower the bound or raise epsilon"
         )
         raise np.linalg.LinAlgError(message)
-    return found
+    weights, coefficients, conditions = found
+    if bound != condition:
+        _warn(basis)
+        return weights, coefficients, DOUBTFUL
+    return weights, coefficients, min(float(conditions.max()), condition)
 
 
 def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits | None:
@@ -222,11 +209,17 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
     fit are dependent.
     """
     fits, q, size = basis.polynomials.shape
-    units = _units(basis, bound)
+    units = np.ones(size)
+    if math.isfinite(bound):
+        # Derivatives count in units of about the spacing of so many centres in the unit ball; a
+        # factor of three changes little.
+        count = basis.points.shape[2]
+        units[count:] = 1.0 / math.sqrt(count)
     directions, inverse, complete = _orthonormal(basis.polynomials * units)
     if fits == 1 and not complete:
         return None
-    found = Fits(np.empty((fits, size)), np.empty((fits, q)), np.empty(fits))
+    weights, coefficients = np.empty((fits, size)), np.empty((fits, q))
+    conditions = np.empty(fits)
 
     def work(start: int, stop: int) -> None:
         for low in range(start, stop, _CHUNK):
@@ -236,26 +229,15 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
                 a[:, np.arange(size), np.arange(size)] += smoothing
             if math.isfinite(bound):
                 a *= units[:, None] * units
-            solved = _solve_some(a, directions[some], inverse[some], units * right[some], bound)
-            for part, values in zip(found, (solved[0] * units, *solved[1:])):
-                part[some] = values
+            given = directions[some], inverse[some], units * right[some]
+            solved, coefficients[some], conditions[some] = _solve_some(a, *given, bound)
+            weights[some] = solved * units
 
     try:
         in_chunks(fits, work, least=_SERIAL)
     except np.linalg.LinAlgError:
         return None
-    return found
-
-
-def _units(basis: Basis, bound: float) -> Floats:
-    """Units (size,) of the unknowns: with a bound, derivatives count in that of the spacing of the
-    centres.
-    """
-    units, count = np.ones(basis.size), basis.points.shape[2]
-    if math.isfinite(bound):
-        # About the spacing of so many centres in the unit ball; a factor of three changes little.
-        units[count:] = 1.0 / math.sqrt(count)
-    return units
+    return weights, coefficients, conditions
 
 
 def _orthonormal(polynomials: Floats) -> tuple[Floats, Floats, bool]:
@@ -282,7 +264,7 @@ def _solve_some(
     a: Floats, directions: Floats, inverse: Floats, right: Floats, bound: float
 ) -> tuple[Floats, Floats, Floats]:
     """The parts of `Fits` for matrices (m, size, size), which are overwritten; letters as in the
-    head of this file.
+    head of this file. LinAlgError where a matrix is not definite.
     """
     size, q = directions.shape[1:]
     turned, products = np.ascontiguousarray(np.swapaxes(directions, 1, 2)), a @ directions
@@ -290,7 +272,7 @@ def _solve_some(
         # The constants are all but the strongest direction.
         norm = np.sqrt(np.einsum("mnq,mnq->mq", products, products).max(axis=1))
         inner = turned @ products
-        gamma = _trace(a) - _trace(inner)
+        gamma = np.trace(a, axis1=1, axis2=2) - np.trace(inner, axis1=1, axis2=2)
         gamma = np.where(gamma > 0.0, gamma / max(size - q, 1), np.where(norm > 0.0, norm, 1.0))
         half = products - 0.5 * directions @ (inner + gamma[:, None, None] * np.eye(q))
         _subtract_loop(a, turned, np.ascontiguousarray(np.swapaxes(half, 1, 2)))
@@ -304,28 +286,18 @@ def _solve_some(
         return np.asarray(vectors - (directions @ (turned @ vectors[:, :, None]))[:, :, 0])
 
     solved = np.stack([annihilating(right), np.zeros_like(right)], axis=1)
-    _factor(a)
+    for matrix in a:
+        # Upper factors U, A = U^T U, replace the upper triangles. The transpose is the same matrix
+        # in Fortran's order, whose lower factor is U^T.
+        _, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
+        if failed:
+            raise np.linalg.LinAlgError("the matrix is not definite")
     solved[:, 1] = _probe(np.diagonal(a, axis1=1, axis2=2))
     _substitute_loop(a, solved)
     weights = annihilating(solved[:, 0])
     short = turned @ right[:, :, None] - np.swapaxes(products, 1, 2) @ weights[:, :, None]
     condition = np.maximum(1.0, norm * np.linalg.norm(solved[:, 1], axis=1))
     return weights, (inverse @ short)[:, :, 0], condition
-
-
-def _factor(a: Floats) -> None:
-    """Put upper factors U, A = U^T U, in the upper triangles of matrices (m, size, size);
-    LinAlgError where one is not definite.
-    """
-    for matrix in a:
-        # Its transpose is the same matrix in Fortran's order, whose lower factor is U^T.
-        _, failed = lapack.dpotrf(matrix.T, lower=1, overwrite_a=1, clean=0)
-        if failed:
-            raise np.linalg.LinAlgError("the matrix is not definite")
-
-
-def _trace(matrices: Floats) -> Floats:
-    return np.asarray(np.trace(matrices, axis1=1, axis2=2))
 
 
 def _largest(matrices: Floats, vectors: Floats, steps: int) -> Floats:

@@ -23,6 +23,7 @@ from rbfmuscle.geometry.exact_distance import nearest_weights
 from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.surfaces import (
     barycentric_weights,
+    edge_lengths,
     face_normals,
     opposite_half_edges,
     split_pinched_vertices,
@@ -55,28 +56,24 @@ class FineMesh(NamedTuple):
 
 def refine_mesh(vertices: Floats, faces: Integers, count: int) -> FineMesh:
     """Split long edges until ``count`` cells of even size can be made of the mesh's triangles."""
-    area = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
-    limit = np.sqrt(2 / np.sqrt(3) * area / count) / FINENESS
+    whole = np.linalg.norm(face_normals(vertices, faces), axis=1).sum()
+    limit = np.sqrt(2 / np.sqrt(3) * whole / count) / FINENESS
     while True:
         sides = np.sort(
             np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1
         )
-        long = np.linalg.norm(vertices[sides[:, 0]] - vertices[sides[:, 1]], axis=1) > limit
+        long = edge_lengths(vertices, sides) > limit
         if not long.any():
-            return _with_neighbours(vertices, faces)
+            break
         vertices, faces = _split_edges(vertices, faces, sides, long)
-
-
-def _with_neighbours(vertices: Floats, faces: Integers) -> FineMesh:
     edges = unique_edges(faces)
     tail = edges.T.ravel()
     order = np.argsort(tail, kind="stable")
     start = np.concatenate([[0], np.cumsum(np.bincount(tail, minlength=len(vertices)))])
     tail, other = tail[order], edges[:, ::-1].T.ravel()[order]
     length = np.linalg.norm(vertices[tail] - vertices[other], axis=1)
-    return FineMesh(
-        vertices, faces, edges, start, tail, other, length, vertex_areas(vertices, faces)
-    )
+    area = vertex_areas(vertices, faces)
+    return FineMesh(vertices, faces, edges, start, tail, other, length, area)
 
 
 def _split_edges(
@@ -96,9 +93,9 @@ def _split_edges(
         one = (number == 1) & (ab >= 0)
         two = (number == 2) & (ca < 0)
         # Of the two ways to halve the quadrilateral left over, the shorter diagonal.
-        short = np.linalg.norm(
-            0.5 * (vertices[b] + vertices[c]) - vertices[a], axis=1
-        ) < np.linalg.norm(0.5 * (vertices[a] + vertices[b]) - vertices[c], axis=1)
+        to_bc = np.linalg.norm(0.5 * (vertices[b] + vertices[c]) - vertices[a], axis=1)
+        to_ab = np.linalg.norm(0.5 * (vertices[a] + vertices[b]) - vertices[c], axis=1)
+        short = to_bc < to_ab
         for rows, triangles in (
             (one, ((a, ab, c), (ab, b, c))),
             (two & short, ((ab, b, bc), (a, ab, bc), (a, bc, c))),
@@ -118,8 +115,7 @@ def cluster_mesh(
 ) -> tuple[Integers, Integers]:
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
     weight = fine.area * density
-    start, tail = fine.start, fine.tail
-    other = fine.other
+    start, tail, other = fine.start, fine.tail, fine.other
     stretch = np.sqrt(density)
     length = fine.length * 0.5 * (stretch[tail] + stretch[other])
     used = np.flatnonzero(np.diff(start) > 0)
@@ -488,7 +484,7 @@ def curvature_density(fine: FineMesh, count: int) -> Floats:
     area = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1)
     normals = vertex_normals(fine.vertices, fine.faces)
     i, j = fine.edges.T
-    length = np.linalg.norm(fine.vertices[i] - fine.vertices[j], axis=1)
+    length = edge_lengths(fine.vertices, fine.edges)
     turn = ((normals[i] - normals[j]) ** 2).sum(axis=1)
     size = len(fine.vertices)
     square = _edge_sum(i, j, turn, size) / np.maximum(
@@ -524,44 +520,43 @@ def spread_points(
 
 def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> SurfaceSample:
     """Points and normals of the cells."""
-    third = np.linalg.norm(face_normals(fine.vertices, fine.faces), axis=1) / 3
+    vectors = face_normals(fine.vertices, fine.faces)
+    third = np.linalg.norm(vectors, axis=1) / 3
     corner = labels[fine.faces]
+
+    def cell_sums(values: Floats) -> Floats:
+        """Sums (count, 3) over the cells of values (m, 3) of the triangles, one for each corner."""
+        thrice = np.repeat(values, 3, axis=0)
+        sums = [np.bincount(corner.ravel(), column, count) for column in thrice.T]
+        return np.stack(sums, axis=1).astype(np.float64)
+
     areas = np.bincount(corner.ravel(), np.repeat(third, 3), count)
     middle = fine.vertices[fine.faces].mean(axis=1)
-    moments = [
-        np.bincount(corner.ravel(), np.repeat(third * middle[:, k], 3), count) for k in range(3)
-    ]
-    centroid = np.stack(moments, axis=1) / np.maximum(areas, np.finfo(float).tiny)[:, None]
+    tiny = np.finfo(float).tiny
+    centroid = cell_sums(third[:, None] * middle) / np.maximum(areas, tiny)[:, None]
     # The nearest point of the cell itself, not of the mesh: that could lie on the other side of a
     # thin sheet.
     points = np.zeros((count, 3))
     piece = np.zeros(count, dtype=np.int64)
     distance = np.full(count, np.inf)
     _nearest_in_cell_loop(fine.vertices, fine.faces, corner, centroid, points, piece, distance)
-    for k in np.flatnonzero(
-        np.isinf(distance)
-    ):  # a cell without a triangle of its own gives a vertex
+    # A cell without a triangle of its own gives a vertex.
+    for k in np.flatnonzero(np.isinf(distance)):
         places = np.flatnonzero(corner == k)
         its = fine.vertices[fine.faces.ravel()[places]]
         nearest = int(np.argmin(((its - centroid[k]) ** 2).sum(axis=1)))
         points[k], piece[k] = its[nearest], places[nearest] // 3
-    normals = _normals_at(fine, points, piece, corner)
-    return SurfaceSample(points, normals, control)
-
-
-def _normals_at(fine: FineMesh, points: Floats, piece: Integers, corner: Integers) -> Floats:
-    """Normals in triangles ``piece``, drawn towards the mean of each point's cell."""
+    # Normals in the triangles, drawn towards the mean of each point's cell.
     corners = fine.faces[piece]
     weights = barycentric_weights(points, fine.vertices[corners])
     here = np.einsum("kc,kcd->kd", weights, vertex_normals(fine.vertices, fine.faces)[corners])
-    vectors = face_normals(fine.vertices, fine.faces)
-    sums = [np.bincount(corner.ravel(), np.repeat(vectors[:, k], 3), len(points)) for k in range(3)]
-    mean: Floats = np.stack(sums, axis=1).astype(np.float64)
-    mean /= np.maximum(np.linalg.norm(mean, axis=1), np.finfo(float).tiny)[:, None]
+    mean = cell_sums(vectors)
+    mean /= np.maximum(np.linalg.norm(mean, axis=1), tiny)[:, None]
     normals = here + CELL_SHARE * mean
     cancelled = np.linalg.norm(normals, axis=1) < 1e-6
     normals[cancelled] = vectors[piece[cancelled]]
-    return normals / np.linalg.norm(normals, axis=1)[:, None]
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return SurfaceSample(points, normals, control)
 
 
 @loop

@@ -201,9 +201,11 @@ class SurfaceBuilder:
         started = time.perf_counter()
         # Axes that turn with the scene: what is sorted by them then falls out alike.
         axes = self.rest.axes @ contacts.poses[self.rest.bones[0]][:3, :3].T
-        # Farther than a cell from the bones a lower bound will do: no vertex gets there.
-        reach = 1.25 * float(np.ptp(points @ axes.T, axis=0).max()) / self._resolution
         names = contacts.bones.names
+
+        def cut(where: Floats, limit: Floats | float) -> tuple[Floats, Floats]:
+            return contacts.bones.nearest(where, contacts.poses, limit)
+
         try:
             field = self.field.through(points[: len(normals)], normals)
             time_fit = time.perf_counter() - started
@@ -211,7 +213,7 @@ class SurfaceBuilder:
                 field,
                 points=points,
                 resolution=self._resolution,
-                clip_distance=_BoneCut(contacts, reach) if names else None,
+                cut=cut if names else None,
                 volume=self.rest.volume,
                 level=self.level,
                 axes=axes,
@@ -250,18 +252,3 @@ def _lengths(vertices: Floats, faces: np.ndarray) -> Floats:
     """Lengths (m, 3) of the triangles' sides."""
     sides = vertices[faces] - vertices[np.roll(faces, 1, axis=1)]
     return np.maximum(np.linalg.norm(sides, axis=2), np.finfo(float).tiny)
-
-
-class _BoneCut:
-    """What the bones cut away: their smallest distance, a lower bound where it is beyond
-    ``reach``.
-    """
-
-    def __init__(self, contacts: BoneContacts, reach: float) -> None:
-        self.contacts, self.reach = contacts, reach
-
-    def __call__(self, points: Floats) -> Floats:
-        return self.contacts.bones.distance(points, self.contacts.poses, self.reach)
-
-    def value_and_gradient_below(self, points: Floats, limit: Floats) -> tuple[Floats, Floats]:
-        return self.contacts.bones.nearest(points, self.contacts.poses, limit)

@@ -140,7 +140,7 @@ def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smooth
     ``most``: ``parted`` (n, 3). Pairs that share a corner go by a share of ``inwards`` (n, 3):
     ``smoothed`` (n, 3). At a corner the pair counts that goes farthest.
     """
-    corners, ways = np.empty((6, 3)), np.empty((6, 3))
+    corners, steps, ways = np.empty((6, 3)), np.empty((6, 3)), np.empty((6, 3))
     both = np.arange(6).reshape(2, 3)
     for k in range(len(pairs)):
         shared = False
@@ -149,19 +149,20 @@ def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smooth
                 same = faces[pairs[k, 0], p] == faces[pairs[k, 1], q]
                 shared |= same
                 both[1, q] = p if same else (both[1, q] if p > 0 else 3 + q)
-        best, way = 0, np.inf
+        way = np.inf
         for d in range(1 if shared else directions.shape[1]):
+            for c in range(6):
+                v = faces[pairs[k, c // 3], c % 3]
+                sign = 1.0 if c < 3 else -1.0
+                for a in range(3):
+                    steps[c, a] = inwards[v, a] if shared else sign * directions[k, d, a]
             low, high = 0.0, 1.0 if shared else most
             for turn in range(HALVINGS + 1):
                 middle = high if turn == 0 else 0.5 * (low + high)
                 for c in range(6):
                     v = faces[pairs[k, c // 3], c % 3]
                     for a in range(3):
-                        if shared:
-                            step = inwards[v, a]
-                        else:
-                            step = directions[k, d, a] if c < 3 else -directions[k, d, a]
-                        corners[c, a] = vertices[v, a] + middle * step
+                        corners[c, a] = vertices[v, a] + middle * steps[c, a]
                 if not cross(corners, both, 0, 1):
                     high = middle
                 elif turn == 0:
@@ -169,15 +170,8 @@ def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smooth
                 else:
                     low = middle
             if high < way:
-                best, way = d, high
-                for c in range(6):
-                    v = faces[pairs[k, c // 3], c % 3]
-                    for a in range(3):
-                        if shared:
-                            ways[c, a] = high * inwards[v, a]
-                        else:
-                            step = high * directions[k, best, a]
-                            ways[c, a] = step if c < 3 else -step
+                way = high
+                ways[:] = high * steps
         out = smoothed if shared else parted
         for c in range(6):
             v = faces[pairs[k, c // 3], c % 3]

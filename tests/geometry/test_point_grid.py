@@ -22,8 +22,7 @@ def test_points_near_triangles_are_those_found_one_by_one():
     among = np.ones(len(vertices), dtype=bool)
 
     def near(of):
-        given = vertices, faces, among, pose, of.points, of.start, of.low, of.edge, of.shape
-        return _near_loop(*given, pairs)
+        return _near_loop(vertices, faces, among, pose, of, pairs)
 
     assert near(PointGrid.of(points[:0])) == 0
     met = near(grid)

@@ -16,12 +16,11 @@ from rbfmuscle.implicit.extraction import Grid, LevelSet
 CENTRE = np.array([1.0, 2.0, 3.0])
 
 
-def extract_surface(field, *, clip_distance=None, **options):
+def extract_surface(field, *, cut=None, **options):
     """The library's, of formulas too."""
-    field, clip_distance = (
-        Formula(part) if inspect.isfunction(part) else part for part in (field, clip_distance)
-    )
-    return extraction.extract_surface(field, clip_distance=clip_distance, **options)
+    field = Formula(field) if inspect.isfunction(field) else field
+    cut = None if cut is None else Formula(cut).value_and_gradient_below
+    return extraction.extract_surface(field, cut=cut, **options)
 
 
 def sphere(radius=50.0, centre=CENTRE):
@@ -86,7 +85,7 @@ def test_any_pattern_of_signs_gives_a_closed_manifold(seed):
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.3])
 def test_mesh_gets_the_wanted_volume(factor, cut):
     wanted = factor * 4 / 3 * np.pi * 50.0**3
-    surface = extract_surface(sphere(), points=on_sphere(), volume=wanted, clip_distance=cut)
+    surface = extract_surface(sphere(), points=on_sphere(), volume=wanted, cut=cut)
     mesh = check_closed(surface)
     assert mesh.volume == pytest.approx(wanted, rel=1e-9)
     value = sphere()(surface.vertices) - surface.level
@@ -106,7 +105,7 @@ def test_chords_do_not_cut_across_a_convex_bone():
     bone = sphere(15.0, CENTRE + [50.0, 0, 0])
     depths = []
     for obstacles in (None, [(PointGrid.of(np.array(ball.vertices)), np.eye(4))]):
-        options = {"clip_distance": bone, "obstacles": obstacles, "volume": 5e5, "resolution": 32}
+        options = {"cut": bone, "obstacles": obstacles, "volume": 5e5, "resolution": 32}
         surface = extract_surface(sphere(), points=on_sphere(), **options)
         assert check_closed(surface).volume == pytest.approx(5e5, rel=1e-9)
         assert bone(surface.vertices).min() > -0.1

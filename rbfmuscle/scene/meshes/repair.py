@@ -145,11 +145,11 @@ def _mend(vertices, faces, *, context, may_be_open):
     if len(state.faces) == 0:
         raise MeshError(f"{context}: nothing is left of the mesh without degenerate triangles")
     _drop_crumbs(state)
-    outer = outer_surface(vertices, state.faces)
-    parts = int(_parts(outer.faces).max()) + 1
-    if may_be_open or (parts == 1 and outer.vertices is vertices):
-        state.vertices, state.faces = outer.vertices, outer.faces
-        state.notes += outer.notes + ([f"the surface has {parts} parts"] if parts > 1 else [])
+    outer, faces, notes = outer_surface(vertices, state.faces)
+    parts = int(_parts(faces).max()) + 1
+    if may_be_open or (parts == 1 and outer is vertices):
+        state.vertices, state.faces = outer, faces
+        state.notes += notes + ([f"the surface has {parts} parts"] if parts > 1 else [])
     state.vertices, state.faces, new, _ = igl.remove_unreferenced(state.vertices, state.faces)
     state.vertex_map = new[state.vertex_map]
     if not _is_closed(state.faces):
