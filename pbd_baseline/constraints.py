@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order, spread
+from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import cross, dot
 from rbfmuscle.geometry.surfaces import triangle_plane, volume_cubic, volume_loop
@@ -117,9 +117,9 @@ class EdgeConstraint:
     """Keeps edge lengths: C = |x_i - x_j| - l, grad_i C = (x_i - x_j) / |x_i - x_j| = -grad_j C.
 
     ``edges`` (e, 2) has each once; those between two vertices of no ``inverse_mass`` (n,) are left
-    out. One PBD projection removes the share ``stiffness`` of an error; ``compliance`` is that of
-    XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of length to rest length an
-    edge is hard whatever its stiffness.
+    out. One PBD projection removes the share ``stiffness`` of an error; the attribute
+    ``compliance`` is that of XPBD times inverse time, 0 is hard. Beyond the ratios ``limits`` of
+    length to rest length an edge is hard whatever its stiffness.
     """
 
     def __init__(
@@ -129,7 +129,6 @@ class EdgeConstraint:
         inverse_mass: Floats,
         *,
         stiffness: Floats | float = 1.0,
-        compliance: float = 0.0,
         limits: list[float] | tuple[float, float] = (0.0, np.inf),
     ) -> None:
         order, self.colours = colour(edges, inverse_mass)
@@ -138,8 +137,8 @@ class EdgeConstraint:
         self.order = order
         self.rest = np.linalg.norm(vertices[self.edges[:, 0]] - vertices[self.edges[:, 1]], axis=1)
         self.limits = float(limits[0]), float(limits[1])
-        self.stiffness = spread(stiffness, order)
-        self.compliance = spread(compliance, order)
+        self.stiffness = np.broadcast_to(np.asarray(stiffness, dtype=float), len(edges))[order]
+        self.compliance = np.zeros(len(order))
 
     def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.edges``."""
@@ -283,7 +282,7 @@ class BendingConstraint:
     2 and 3 and unnormalised face normals n_2 and n_3, grad_2 t = -|e| n_2 / |n_2|^2 and grad_3 t =
     -|e| n_3 / |n_3|^2; the edge's ends take the opposite, split by where the wings' feet fall.
     Edges and wings (e, 2) are those of a `Topology`, of whose vertices ``inverse_mass`` (n,) says
-    which are held; the compliance is per radian squared.
+    which are held; the attribute ``compliance`` is that of XPBD per radian squared, 0 is hard.
     """
 
     def __init__(
@@ -294,7 +293,6 @@ class BendingConstraint:
         inverse_mass: Floats,
         *,
         stiffness: float = 0.9,
-        compliance: float = 0.0,
     ) -> None:
         members = np.column_stack([edges, wings])
         order, self.colours = colour(members, inverse_mass)
@@ -304,7 +302,7 @@ class BendingConstraint:
         self.rest = np.empty((len(order), 2))
         _dihedral_loop(vertices, self.members, self.rest)
         self.stiffness = float(stiffness)
-        self.compliance = float(compliance)
+        self.compliance = 0.0
 
     def values(self, points: Floats) -> Floats:
         """C of each edge, in the order of ``self.members``."""

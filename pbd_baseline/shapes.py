@@ -64,37 +64,6 @@ class ARAP:
         return out
 
 
-class ARAPConstraint:
-    """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first
-    option.
-
-    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component,
-    compliance 1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
-    """
-
-    def __init__(self, arap: ARAP, inverse_mass: Floats) -> None:
-        self.arap, self.inverse_mass = arap, inverse_mass
-        edges = arap.topology.edges
-        order, self.colours = colour(edges, inverse_mass)
-        self.order = order
-        self.edges = members_in_order(edges, order)
-        self.rest = np.ascontiguousarray(arap.rest[order])
-        # a mesh whose median cotangent is 0 has weights of 0
-        self.compliance = 1.0 / np.maximum(arap.weights[order], LEAST_WEIGHT)
-
-    def project(self, points: Floats, *, time: float = 1.0) -> None:
-        """One Gauss-Seidel sweep over ``points`` (n, 3), in place, with the arap's rotations."""
-        _constraint_loop(
-            points,
-            self.inverse_mass,
-            self.edges,
-            self.rest,
-            self.arap.quaternions,
-            self.compliance,
-            time,
-        )
-
-
 @loop
 def _rotation_loop(points, rings, rest, weights, quaternions):
     start, ring, ring_edge, edges = rings
@@ -187,13 +156,14 @@ def _target_loop(edges, rest, weights, quaternions, out):
 
 
 @loop
-def _constraint_loop(points, inverse_mass, edges, rest, quaternions, compliance, time):
+def _constraint_loop(points, inverse_mass, edges, order, rest, quaternions, compliance, time):
     for c in range(len(edges)):
         i, j = edges[c, 0], edges[c, 1]
         wi, wj = inverse_mass[i], inverse_mass[j]
         soft = compliance[c] / time
         total = wi + wj + soft
-        one, two = rotate(quaternions[i], rest[c]), rotate(quaternions[j], rest[c])
+        apart = rest[order[c]]
+        one, two = rotate(quaternions[i], apart), rotate(quaternions[j], apart)
         for k in range(3):
             value = points[i, k] - points[j, k] - 0.5 * (one[k] + two[k])
             change = -value / total
@@ -348,23 +318,43 @@ class XPBDShape(Shape):
 
 
 class ARAPShape(Shape):
-    """The ARAP energy as PBD constraints: the paper's section 6.2, first option."""
+    """The ARAP energy as PBD constraints, a vector one an edge: the paper's section 6.2, first
+    option.
+
+    C = (x_i - x_j) - (R_i + R_j) (X_i - X_j) / 2, grad_i C = 1 = -grad_j C in each component,
+    compliance 1 / w_ij: at convergence the gradient of the sum is that of the ARAP energy.
+    """
 
     def __init__(self, rest: RestState, options: PBDOptions, stiffer: Floats | float = 1.0) -> None:
         super().__init__(rest, options, stiffer)
         self.arap = ARAP(rest.vertices, rest.topology, stiffer=stiffer)
         self.quaternions = self.arap.quaternions
-        self.constraint = ARAPConstraint(self.arap, rest.inverse_mass)
+        self.order, _ = colour(rest.topology.edges, rest.inverse_mass)
+        self.edges = members_in_order(rest.topology.edges, self.order)
+        # a mesh whose median cotangent is 0 has weights of 0
+        self.compliance = 1.0 / np.maximum(self.arap.weights[self.order], LEAST_WEIGHT)
 
     def contract(self, fibres: MeshFibres, points: np.ndarray) -> None:
         """Take rest vectors from the fibres."""
         self.arap.rest = fibres.targets(points)
-        self.constraint.rest = np.ascontiguousarray(self.arap.rest[self.constraint.order])
 
     def sweep(self, points: Floats, time: float) -> None:
-        """Rotations, then one small step of the constraints."""
+        """Rotations, then one Gauss-Seidel sweep over the constraints, a small step."""
         self.arap.fit_rotations(points)
-        self.constraint.project(points, time=time)
+        self.project(points, time)
+
+    def project(self, points: Floats, time: float) -> None:
+        """One sweep over the constraints with the present rotations, in place."""
+        _constraint_loop(
+            points,
+            self.inverse_mass,
+            self.edges,
+            self.order,
+            self.arap.rest,
+            self.arap.quaternions,
+            self.compliance,
+            time,
+        )
 
 
 class GlobalARAPShape(Shape):

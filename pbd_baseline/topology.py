@@ -43,7 +43,10 @@ class Topology:
         """
         vertices, faces = check_mesh(vertices, faces)
         edges, wings = _edges_and_wings(faces)
-        ring_start, ring, ring_edge = _one_rings(edges, len(vertices))
+        source, target = np.concatenate([edges, edges[:, ::-1]]).T
+        order = np.lexsort((target, source))
+        ring_start = np.searchsorted(source[order], np.arange(len(vertices) + 1))
+        ring, ring_edge = np.ascontiguousarray(target[order]), order % len(edges)
         lonely = np.flatnonzero(np.diff(ring_start) == 0)
         if len(lonely):
             raise MeshError(
@@ -76,15 +79,6 @@ def _edges_and_wings(faces):
     return edges, np.column_stack([apex[along], apex[opposite[along]]])
 
 
-def _one_rings(edges, count):
-    source = np.concatenate([edges[:, 0], edges[:, 1]])
-    target = np.concatenate([edges[:, 1], edges[:, 0]])
-    index = np.tile(np.arange(len(edges)), 2)
-    order = np.lexsort((target, source))
-    start = np.concatenate([[0], np.cumsum(np.bincount(source, minlength=count))])
-    return start, np.ascontiguousarray(target[order]), np.ascontiguousarray(index[order])
-
-
 def colour(members: Integers, inverse_mass: Floats) -> tuple[Integers, Integers]:
     """Order constraints, given by their vertices (c, k), so that those of one colour share no
     vertex; without those that can move none, by the ``inverse_mass`` (n,) of the vertices.
@@ -111,14 +105,6 @@ def colour(members: Integers, inverse_mass: Floats) -> tuple[Integers, Integers]
 def members_in_order(members: Integers, order: Integers) -> Array:
     """Vertices (l, k) of constraints in the order of their colours, for the loops over them."""
     return np.ascontiguousarray(members[order], dtype=np.uint32)
-
-
-def spread(value: Floats | float, order: Integers) -> Floats:
-    """A constraint's parameter, one number or one a constraint, as an array in the order of the
-    colours.
-    """
-    value = np.asarray(value, dtype=np.float64)
-    return np.ascontiguousarray(value[order]) if value.ndim else np.full(len(order), float(value))
 
 
 @loop

@@ -53,12 +53,12 @@ class FaceTree:
         ringed = (self.faces, opposite) if self.closed else (self.faces[:0], opposite[:0])
         self._rings = vertex_rings(*ringed, len(vertices))
 
-    def crossing(self, vertices: Floats, among: Booleans | None = None) -> Booleans:
+    def crossing(self, vertices: Floats) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
-        now; ``among`` as in `pairs`.
+        now.
         """
         found = np.zeros(len(self.faces), dtype=np.bool_)
-        found[self.pairs(vertices, among)] = True
+        found[self.pairs(vertices)] = True
         return found
 
     def pairs(

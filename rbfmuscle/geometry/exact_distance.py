@@ -179,14 +179,8 @@ class Tree(NamedTuple):
     order: NDArray[np.int64]
 
 
-class Layout(NamedTuple):
-    """What stays where vertices move: order of the triangles, starts of the leaves, faces across
-    the edges.
-    """
-
-    order: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    across: NDArray[np.int64]
+# What stays where vertices move: order of the triangles, starts of the leaves, faces across edges.
+Layout = tuple[Integers, Integers, Integers]
 
 
 class ExactDistance:
@@ -216,8 +210,16 @@ class ExactDistance:
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
         faces = np.ascontiguousarray(faces, dtype=np.int64)
         self.vertices, self.faces = vertices, faces
-        self.layout = _layout(vertices, faces) if layout is None else layout
-        order, starts, _ = self.layout
+        if layout is None:
+            order = np.arange(len(faces))
+            depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
+            starts = np.zeros((1 << depth) + 1, dtype=np.int64)
+            # One corner after another, which takes a third of the time of a mean over all.
+            middle = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3.0
+            _order_loop(middle, order, depth, starts)
+            layout = order, starts, faces_across(faces)
+        self.layout = layout
+        order, starts, _ = layout
         #: The arrays that :func:`nearest_triangle` takes.
         self.tree = Tree(
             np.empty((2 * len(starts) - 2, 6)), starts, np.empty((len(faces), WIDTH)), order
@@ -244,7 +246,7 @@ class ExactDistance:
         angles = np.column_stack([at_a, at_b, np.pi - at_a - at_b])
         of_vertices = np.zeros((len(self.vertices), 3))
         np.add.at(of_vertices, self.faces, angles[:, :, None] * unit[:, None])
-        across = self.layout.across
+        across = self.layout[2]
         other = np.where((across >= 0)[:, :, None], unit[across], 0.0)
         return unit[:, None] + other, of_vertices
 
@@ -288,16 +290,6 @@ class ExactDistance:
 
         in_chunks(len(points), work)
         return distance
-
-
-def _layout(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Layout:
-    order = np.arange(len(faces))
-    depth = max(0, int(np.ceil(np.log2(len(faces) / LEAF))))
-    starts = np.zeros((1 << depth) + 1, dtype=np.int64)
-    # One corner after another, which takes a third of the time of a mean over all.
-    middle = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3.0
-    _order_loop(middle, order, depth, starts)
-    return Layout(order, starts, faces_across(faces))
 
 
 def faces_across(faces: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -44,7 +44,18 @@ def tube_mesh(line: Floats, radii: Floats, sides: int = SIDES) -> tuple[Floats, 
     angles = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
     spokes = np.cos(angles)[:, None] * first[:, None] + np.sin(angles)[:, None] * second[:, None]
     rings = line[:, None] + radii[:, None, None] * spokes
-    return np.concatenate([rings.reshape(-1, 3), line[[0, -1]]]), _tube_faces(len(line), sides)
+    side = np.arange(sides)
+    after = np.roll(side, -1)
+    base = sides * np.arange(len(line) - 1)[:, None]
+    a, b, c, d = (base + k for k in (side, after, sides + side, sides + after))
+    wall = np.stack([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(-1, 3)
+    last, tips = sides * (len(line) - 1), sides * len(line)
+    fans = [
+        np.stack([np.full(sides, tips), after, side], axis=-1),
+        np.stack([np.full(sides, tips + 1), last + side, last + after], axis=-1),
+    ]
+    vertices = np.concatenate([rings.reshape(-1, 3), line[[0, -1]]])
+    return vertices, np.concatenate([wall, *fans])
 
 
 def _frames(line: Floats) -> tuple[Floats, Floats]:
@@ -58,23 +69,6 @@ def _frames(line: Floats) -> tuple[Floats, Floats]:
         before = before - (before @ direction) * direction
         before = across[k] = unit(before)
     return across, np.cross(ahead, across)
-
-
-def _tube_faces(rings: int, sides: int) -> Integers:
-    """Outward faces of so many rings, then of the fans at both ends."""
-    side = np.arange(sides)
-    after = np.roll(side, -1)
-    base = sides * np.arange(rings - 1)[:, None]
-    a, b, c, d = (base + k for k in (side, after, sides + side, sides + after))
-    wall = np.concatenate([np.stack([a, b, d], axis=-1), np.stack([a, d, c], axis=-1)]).reshape(
-        -1, 3
-    )
-    last, tips = sides * (rings - 1), sides * rings
-    fans = [
-        np.stack([np.full(sides, tips), after, side], axis=-1),
-        np.stack([np.full(sides, tips + 1), last + side, last + after], axis=-1),
-    ]
-    return np.concatenate([wall, *fans])
 
 
 def taut_line(

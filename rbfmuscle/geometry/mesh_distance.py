@@ -4,10 +4,10 @@ distances that are sure of their side where a mesh is folded or open.
 
 from collections.abc import Callable
 from functools import cached_property
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
 from rbfmuscle.geometry.exact_distance import FACE, ExactDistance, Layout, offset_in_frame
@@ -76,24 +76,6 @@ _MOST_CELLS = 512
 HERE = np.eye(4)
 
 
-class _Grid(NamedTuple):
-    """Cells of the plane across the columns and the triangles whose boxes meet each.
-
-    ``axes`` are x and y of the plane and z along the columns; ``items[starts[c] : starts[c + 1]]``
-    are the triangles of cell ``c``, between heights ``ends[c]``; ``width`` is the number of cells
-    along x.
-    """
-
-    axes: tuple[int, int, int]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    fine: float
-    width: int
-    starts: NDArray[np.int64]
-    items: NDArray[np.int64]
-    ends: NDArray[np.float64]
-
-
 class Columns:
     """Counts how often a closed, consistently oriented mesh winds around points, along a line from
     each of them.
@@ -113,31 +95,36 @@ class Columns:
         cells = min(max(int(len(faces) ** 0.5), 1), _MOST_CELLS)
         fine = cells / max(float((high - low).max()), 1e-300)
         width, height = (int((high[k] - low[k]) * fine) + 1 for k in axes[:2])
+        self._place = axes, low, high, fine, width
+        # Triangles whose boxes meet each cell c of the plane across the columns,
+        # items[starts[c] : starts[c + 1]], which lie between heights ends[c].
         starts = np.zeros(width * height + 1, dtype=np.int64)
         ends = np.repeat([[np.inf, -np.inf]], width * height, axis=0)
-        self._grid = _Grid(axes, low, high, fine, width, starts, np.empty(0, dtype=np.int64), ends)
         covered = np.empty((len(faces), 4), dtype=np.int64)
-        _count_loop(vertices, faces, self._grid, covered)
+        _count_loop(vertices, faces, self._place, covered, starts, ends)
         np.cumsum(starts, out=starts)
-        self._grid = self._grid._replace(items=np.empty(starts[-1], dtype=np.int64))
-        _sort_loop(covered, width, starts, self._grid.items)
+        items = np.empty(starts[-1], dtype=np.int64)
+        _sort_loop(covered, width, starts, items)
+        self._cells = starts, items, ends
 
     def inside(self, points: Floats, pose: Floats) -> Booleans:
         """Mask (n,) of the points (n, 3) that lie inside once a pose (4, 4) has carried them."""
         out = np.zeros(len(points), dtype=np.bool_)
-        _inside_loop(points, pose, self.vertices, self.faces, self._grid, out)
+        _inside_loop(points, pose, self.vertices, self.faces, self._place, self._cells, out)
         return out
 
 
 @loop
-def _count_loop(vertices, faces, grid, covered):
-    """Cells that each triangle's box covers, by column and row, and in ``starts`` how many
-    triangles each cell has.
+def _count_loop(vertices, faces, place, covered, starts, ends):
+    """Cells that each triangle's box covers, by column and row, in ``starts`` how many triangles
+    each cell has, and in ``ends`` between which heights.
+
+    The ``place`` of the grid is axes, x and y of the plane and z along the columns, the corners of
+    the mesh's box, cells for each unit of length, and the number of cells along x.
     """
-    u, v, w = grid.axes
-    x = grid.low[u]
-    y = grid.low[v]
-    fine = grid.fine
+    (u, v, w), low, _, fine, width = place
+    x = low[u]
+    y = low[v]
     for f in range(len(faces)):
         a, b, c = row_of(faces, f)
         covered[f, 0] = int((min(vertices[a, u], vertices[b, u], vertices[c, u]) - x) * fine)
@@ -147,10 +134,10 @@ def _count_loop(vertices, faces, grid, covered):
         bottom = min(vertices[a, w], vertices[b, w], vertices[c, w])
         top = max(vertices[a, w], vertices[b, w], vertices[c, w])
         for j in range(covered[f, 2], covered[f, 3] + 1):
-            for cell in range(j * grid.width + covered[f, 0], j * grid.width + covered[f, 1] + 1):
-                grid.starts[cell] += 1
-                grid.ends[cell, 0] = min(grid.ends[cell, 0], bottom)
-                grid.ends[cell, 1] = max(grid.ends[cell, 1], top)
+            for cell in range(j * width + covered[f, 0], j * width + covered[f, 1] + 1):
+                starts[cell] += 1
+                ends[cell, 0] = min(ends[cell, 0], bottom)
+                ends[cell, 1] = max(ends[cell, 1], top)
 
 
 @loop
@@ -164,11 +151,10 @@ def _sort_loop(covered, width, starts, items):
 
 
 @loop
-def _inside_loop(points, pose, vertices, faces, grid, out):
-    low = grid.low
-    high = grid.high
-    fine = grid.fine
-    u, v, w = grid.axes
+def _inside_loop(points, pose, vertices, faces, place, cells, out):
+    axes, low, high, fine, width = place
+    starts, items, ends = cells
+    u, v, w = axes
     at = np.empty(3)
     for n in range(len(points)):
         x, y, z = row_of(points, n)
@@ -179,11 +165,11 @@ def _inside_loop(points, pose, vertices, faces, grid, out):
         if outside:
             continue
         i, j = int((at[u] - low[u]) * fine), int((at[v] - low[v]) * fine)
-        cell, count = j * grid.width + i, 0
-        if not (grid.ends[cell, 0] <= at[w] <= grid.ends[cell, 1]):
+        cell, count = j * width + i, 0
+        if not (ends[cell, 0] <= at[w] <= ends[cell, 1]):
             continue
-        for m in range(grid.starts[cell], grid.starts[cell + 1]):
-            count += _above(at, vertices, faces, grid.items[m], grid.axes)
+        for m in range(starts[cell], starts[cell + 1]):
+            count += _above(at, vertices, faces, items[m], axes)
         out[n] = count > 0
 
 

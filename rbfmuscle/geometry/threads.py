@@ -3,12 +3,12 @@ the lock.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
-from threading import Condition, Lock, local
+from threading import Lock, local
 from typing import TypeVar
 
 from numba import config
@@ -123,39 +123,33 @@ def in_stages(
     ``cost`` says how long an item takes in both stages: what has the most left to do goes first, so
     that no thread waits long for the last of them.
     """
-    ready = [(-sum(sum(cost(item)) for item in group), k, -1) for k, group in enumerate(groups)]
-    heapify(ready)
-    results: dict[tuple[int, int], Result] = {}
-    changed, pending = Condition(), {*range(len(groups))}  # groups whose first stage is not over
-
-    def work(_: int) -> None:
-        while True:
-            with changed:
-                changed.wait_for(lambda: ready or not pending)
-                if not ready:
-                    return
-                _, number, part = heappop(ready)
-            try:
-                if part >= 0:
-                    results[number, part] = second(groups[number][part])
-                    continue
-                first(number)
-            except BaseException:
-                with changed:
-                    ready.clear()
-                    pending.clear()
-                    changed.notify_all()
-                raise
-            with changed:
-                pending.discard(number)
-                for part, item in enumerate(groups[number]):
-                    heappush(ready, (-cost(item)[1], number, part))
-                changed.notify_all()
-
     if len(groups) == 1:  # it has all threads to itself
         first(0)
         return [each(second, groups[0])]
-    each(work, range(thread_count()))
+    workers = thread_count()
+    ready = [(-sum(sum(cost(item)) for item in group), k, -1) for k, group in enumerate(groups)]
+    heapify(ready)
+    results: dict[tuple[int, int], Result] = {}
+    running: dict[Future, tuple[int, int]] = {}  # group, and item of its second stage or -1
+    try:
+        while ready or running:
+            while ready and len(running) < workers:
+                _, number, part = heappop(ready)
+                if part < 0:
+                    future = _pool(workers).submit(first, number)
+                else:
+                    future = _pool(workers).submit(second, groups[number][part])
+                running[future] = number, part
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                number, part = running.pop(future)
+                found = future.result()
+                if part >= 0:
+                    results[number, part] = found
+                    continue
+                for part, item in enumerate(groups[number]):
+                    heappush(ready, (-cost(item)[1], number, part))
+    finally:
+        wait(running)
     return [[results[k, part] for part in range(len(group))] for k, group in enumerate(groups)]
 
 

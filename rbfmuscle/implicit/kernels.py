@@ -22,7 +22,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from hashlib import sha256
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -274,46 +273,38 @@ class Kernel:
         return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
-class _Phi(NamedTuple):
-    """s**power (base * inner + outer), coefficients from the constant up; extra is the base's own
-    exponent, as of (1 - s)+**4 (1 + 4 s): ``CUT, _Phi(0, (1, 4), (), 4)``.
-    """
-
-    power: int
-    inner: tuple[float | Fraction, ...] = ()
-    outer: tuple[float | Fraction, ...] = ()
-    extra: int = 0
-
-
-# name, order m, C^k at 0, compact, has epsilon, own parameter, base, phi
-_ROWS = [
-    ("linear", 1, 0, False, False, 0.0, ONE, _Phi(1, (), (-1,))),
-    ("cubic", 2, 2, False, False, 0.0, ONE, _Phi(3, (), (1,))),
-    ("quintic", 3, 4, False, False, 0.0, ONE, _Phi(5, (), (-1,))),
-    ("septic", 4, 6, False, False, 0.0, ONE, _Phi(7, (), (1,))),
-    ("thin_plate_spline", 2, 1, False, False, 0.0, LOG, _Phi(2, (1,))),
-    ("polyharmonic_4", 3, 3, False, False, 0.0, LOG, _Phi(4, (-1,))),
-    ("gaussian", 0, 99, False, True, 0.0, GAUSS, _Phi(0, (1,))),
+Phi = tuple[int, tuple[float | Fraction, ...], tuple[float | Fraction, ...], int]
+# name, order m, C^k at 0, compact, has epsilon, own parameter, base, and phi =
+# s**power (base * inner + outer): the power, coefficients of inner and outer from the constant up,
+# and the base's own exponent
+_ROWS: list[tuple[str, int, int, bool, bool, float, int, Phi]] = [
+    ("linear", 1, 0, False, False, 0.0, ONE, (1, (), (-1,), 0)),
+    ("cubic", 2, 2, False, False, 0.0, ONE, (3, (), (1,), 0)),
+    ("quintic", 3, 4, False, False, 0.0, ONE, (5, (), (-1,), 0)),
+    ("septic", 4, 6, False, False, 0.0, ONE, (7, (), (1,), 0)),
+    ("thin_plate_spline", 2, 1, False, False, 0.0, LOG, (2, (1,), (), 0)),
+    ("polyharmonic_4", 3, 3, False, False, 0.0, LOG, (4, (-1,), (), 0)),
+    ("gaussian", 0, 99, False, True, 0.0, GAUSS, (0, (1,), (), 0)),
     # signs as conditional definiteness wants them
-    ("multiquadric", 1, 99, False, True, 0.5, BINOMIAL, _Phi(0, (-1,))),
-    ("inverse_multiquadric", 0, 99, False, True, -0.5, BINOMIAL, _Phi(0, (1,))),
-    ("inverse_quadratic", 0, 99, False, True, -1.0, BINOMIAL, _Phi(0, (1,))),
-    ("generalised_multiquadric", 2, 99, False, True, 1.5, BINOMIAL, _Phi(0, (1,))),
-    ("matern_12", 0, 0, False, True, 0.0, EXP, _Phi(0, (1,))),
-    ("matern_32", 0, 2, False, True, 0.0, EXP, _Phi(0, (1, 1))),
-    ("matern_52", 0, 4, False, True, 0.0, EXP, _Phi(0, (1, 1, Fraction(1, 3)))),
-    ("matern_72", 0, 6, False, True, 0.0, EXP, _Phi(0, (1, 1, Fraction(2, 5), Fraction(1, 15)))),
-    ("wendland_c0", 0, 0, True, True, 0.0, CUT, _Phi(0, (1,), (), 2)),
-    ("wendland_c2", 0, 2, True, True, 0.0, CUT, _Phi(0, (1, 4), (), 4)),
-    ("wendland_c4", 0, 4, True, True, 0.0, CUT, _Phi(0, (1, 6, Fraction(35, 3)), (), 6)),
-    ("wendland_c6", 0, 6, True, True, 0.0, CUT, _Phi(0, (1, 8, 25, 32), (), 8)),
-    ("wendland_51", 0, 2, True, True, 0.0, CUT, _Phi(0, (1, 5), (), 5)),
-    ("buhmann", 0, 2, True, True, 0.0, LOG, _Phi(0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21))),
-    ("skala_cervenka", 2, 3, False, False, 1.8, POWER, _Phi(2, (1,), (-1,))),
+    ("multiquadric", 1, 99, False, True, 0.5, BINOMIAL, (0, (-1,), (), 0)),
+    ("inverse_multiquadric", 0, 99, False, True, -0.5, BINOMIAL, (0, (1,), (), 0)),
+    ("inverse_quadratic", 0, 99, False, True, -1.0, BINOMIAL, (0, (1,), (), 0)),
+    ("generalised_multiquadric", 2, 99, False, True, 1.5, BINOMIAL, (0, (1,), (), 0)),
+    ("matern_12", 0, 0, False, True, 0.0, EXP, (0, (1,), (), 0)),
+    ("matern_32", 0, 2, False, True, 0.0, EXP, (0, (1, 1), (), 0)),
+    ("matern_52", 0, 4, False, True, 0.0, EXP, (0, (1, 1, Fraction(1, 3)), (), 0)),
+    ("matern_72", 0, 6, False, True, 0.0, EXP, (0, (1, 1, Fraction(2, 5), Fraction(1, 15)), (), 0)),
+    ("wendland_c0", 0, 0, True, True, 0.0, CUT, (0, (1,), (), 2)),
+    ("wendland_c2", 0, 2, True, True, 0.0, CUT, (0, (1, 4), (), 4)),
+    ("wendland_c4", 0, 4, True, True, 0.0, CUT, (0, (1, 6, Fraction(35, 3)), (), 6)),
+    ("wendland_c6", 0, 6, True, True, 0.0, CUT, (0, (1, 8, 25, 32), (), 8)),
+    ("wendland_51", 0, 2, True, True, 0.0, CUT, (0, (1, 5), (), 5)),
+    ("buhmann", 0, 2, True, True, 0.0, LOG, (0, (0, 0, 0, 0, 12), (1, 0, -12, 32, -21), 0)),
+    ("skala_cervenka", 2, 3, False, False, 1.8, POWER, (2, (1,), (-1,), 0)),
 ]
 
 
-def _radial_rows(base: int, parameter: float, phi: _Phi) -> Floats:
+def _radial_rows(base: int, parameter: float, phi: Phi) -> Floats:
     """Rows (3, 2 + 2 `TERMS`): j, the base's own exponent, A, B; each (1/s) d/ds of the last, in
     exact fractions.
     """
