@@ -140,12 +140,6 @@ class EdgeConstraint:
         self.stiffness = np.broadcast_to(np.asarray(stiffness, dtype=float), len(edges))[order]
         self.compliance = np.zeros(len(order))
 
-    def values(self, points: Floats) -> Floats:
-        """C of each edge, in the order of ``self.edges``."""
-        return (
-            np.linalg.norm(points[self.edges[:, 0]] - points[self.edges[:, 1]], axis=1) - self.rest
-        )
-
     def project(self, points: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""
         _edge_loop(
@@ -303,14 +297,6 @@ class BendingConstraint:
         _dihedral_loop(vertices, self.members, self.rest)
         self.stiffness = float(stiffness)
         self.compliance = 0.0
-
-    def values(self, points: Floats) -> Floats:
-        """C of each edge, in the order of ``self.members``."""
-        now = np.empty_like(self.rest)
-        _dihedral_loop(points, self.members, now)
-        sine = now[:, 1] * self.rest[:, 0] - now[:, 0] * self.rest[:, 1]
-        cosine = now[:, 0] * self.rest[:, 0] + now[:, 1] * self.rest[:, 1]
-        return 2.0 * sine / np.maximum(1.0 + cosine, TINY)
 
     def project(self, points: Floats) -> None:
         """One Gauss-Seidel sweep over ``points`` (n, 3), in place."""

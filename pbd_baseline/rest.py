@@ -127,8 +127,6 @@ def edge_stiffness(
     """k = (1 - |cos(edge, fibre)|)^a, (e,): edges along the fibres are soft (Cervenka and Kohout, a
     = 0.5).
     """
-    if exponent == 0.0:
-        return np.ones(len(edges))
     along = unit(vertices[edges[:, 1]] - vertices[edges[:, 0]])
     fibre = directions[edges[:, 0]]
     other = directions[edges[:, 1]]

@@ -142,14 +142,11 @@ def winding_number(bone, x, y, z, stack):
     while top >= 0:
         node = stack[top]
         top -= 1
-        away = 0.0
+        offset = minus(row_of(dipoles, node), (x, y, z))
+        away = dot(offset, offset)
+        flux = dot(offset, (dipoles[node, 3], dipoles[node, 4], dipoles[node, 5]))
         radius = 0.0
-        flux = 0.0
         for k in range(3):
-            at = x if k == 0 else (y if k == 1 else z)
-            offset = dipoles[node, k] - at
-            away += offset * offset
-            flux += offset * dipoles[node, 3 + k]
             radius += (
                 max(boxes[node, 3 + k] - dipoles[node, k], dipoles[node, k] - boxes[node, k]) ** 2
             )

@@ -50,8 +50,7 @@ class FaceTree:
         self._boxes: tuple[Floats, Floats] | None = None
         opposite = opposite_half_edges(self.faces)
         self.closed = bool((opposite >= 0).all())
-        ringed = (self.faces, opposite) if self.closed else (self.faces[:0], opposite[:0])
-        self._rings = vertex_rings(*ringed, len(vertices))
+        self._rings = vertex_rings(self.faces, opposite, len(vertices)) if self.closed else None
 
     def crossing(self, vertices: Floats) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
@@ -79,11 +78,12 @@ class FaceTree:
         asked = np.zeros(LEAF * self._leaves, dtype=np.bool_)
         asked[: len(self.faces)] = True if among is None else among[self._order]
         plain = np.zeros(len(vertices), dtype=np.bool_)
-        if folds and self.closed:
+        folds &= self.closed
+        if folds and self._rings is not None:
             plain_loop(vertices, *self._rings, plain)
         wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
         # Without a folded corner and without triangles that are asked for no box is made.
-        if not _asked_loop(self._corners, plain, folds and self.closed, asked, wanted):
+        if not _asked_loop(self._corners, plain, folds, asked, wanted):
             return np.zeros((0, 2), dtype=np.int64)
         whole = self._boxes is None or not again
         if self._boxes is None:
@@ -352,8 +352,7 @@ def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integ
         now = beside[now]
         going = now != first[walks]
         walks, now = walks[going], now[going]
-    row = np.concatenate([np.zeros(0, np.int64), *rows])
-    step = np.concatenate([np.zeros(0, np.int64), *steps])
+    row, step = np.concatenate(rows), np.concatenate(steps)
     whole = (np.bincount(row, minlength=count) == used)[row]
     row, step = row[whole], step[whole]
     order = np.argsort(row, kind="stable")

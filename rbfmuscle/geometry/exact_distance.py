@@ -315,21 +315,15 @@ def _order_loop(centres, order, depth, starts):
         for node in range(1 << level):
             low, high = starts[node * step], starts[(node + 1) * step]
             middle = starts[node * step + step // 2]
-            axis = _longest_axis(centres, order, low, high)
+            longest, axis = -1.0, 0
+            for k in range(3):
+                least, most = np.inf, -np.inf
+                for n in range(low, high):
+                    value = centres[order[n], k]
+                    least, most = min(least, value), max(most, value)
+                if most - least > longest:
+                    longest, axis = most - least, k
             _select(centres[:, axis], order, low, high - 1, middle)
-
-
-@loop
-def _longest_axis(centres, order, low, high):
-    longest, axis = -1.0, 0
-    for k in range(3):
-        least, most = np.inf, -np.inf
-        for n in range(low, high):
-            value = centres[order[n], k]
-            least, most = min(least, value), max(most, value)
-        if most - least > longest:
-            longest, axis = most - least, k
-    return axis
 
 
 @loop

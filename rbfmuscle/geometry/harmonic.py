@@ -18,22 +18,14 @@ def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     Negative cotangents (22 % on a long muscle mesh) would break the maximum principle, so that
     weights would leave [0, 1]; they are raised to a small positive share of the mean weight.
     """
-    rows = []
-    cols = []
-    values = []
-    for k in range(3):
-        i = faces[:, (k + 1) % 3]
-        j = faces[:, (k + 2) % 3]
-        o = faces[:, k]
-        u, v = vertices[i] - vertices[o], vertices[j] - vertices[o]
-        twice_area = np.linalg.norm(np.cross(u, v), axis=1)
-        cotangent = 0.5 * np.einsum("ij,ij->i", u, v) / np.maximum(twice_area, 1e-300)
-        rows.append(i)
-        cols.append(j)
-        values.append(cotangent)
-    rows, cols, values = map(np.concatenate, (rows, cols, values))
+    # The ends of the edge opposite to each corner of the faces.
+    i, j = np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)
+    u, v = vertices[i] - vertices[faces], vertices[j] - vertices[faces]
+    twice_area = np.linalg.norm(np.cross(u, v), axis=2)
+    cotangent = 0.5 * np.einsum("fki,fki->fk", u, v) / np.maximum(twice_area, 1e-300)
     count = len(vertices)
-    half = sparse.coo_matrix((values, (rows, cols)), shape=(count, count)).tocsr()
+    ends = i.T.ravel(), j.T.ravel()
+    half = sparse.coo_matrix((cotangent.T.ravel(), ends), shape=(count, count)).tocsr()
     edges = sparse.triu(half + half.T, format="coo")
     weights = np.clip(edges.data, 1e-3 * np.median(np.abs(edges.data)), 1e3)
     return graph_laplacian(edges.row, edges.col, weights, count)

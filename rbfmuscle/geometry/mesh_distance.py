@@ -189,10 +189,7 @@ def _above(at, vertices, faces, f, axes):
         a, b = faces[f, k], faces[f, (k + 1) % 3]
         if (vertices[a, v] <= y) == (vertices[b, v] <= y):
             continue
-        if found == 0:
-            west = _met(vertices, a, b, y, axes)
-        else:
-            east = _met(vertices, a, b, y, axes)
+        west, east = east, _met(vertices, a, b, y, axes)
         found += 1
     if found < 2:
         return 0
