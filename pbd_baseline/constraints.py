@@ -15,8 +15,8 @@ import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.frames import cross, dot
-from rbfmuscle.geometry.surfaces import triangle_plane, volume_cubic, volume_loop
+from rbfmuscle.geometry.frames import cross, dot, row_of
+from rbfmuscle.geometry.surfaces import corner_from, triangle_plane, volume_cubic, volume_loop
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import BoneContacts
 
@@ -315,21 +315,18 @@ class BendingConstraint:
 def _dihedral_loop(points, members, out):
     """Cosine and sine of the signed dihedral angle, positive on a convex edge."""
     for c in range(len(members)):
-        i = members[c, 0]
-        j = members[c, 1]
-        k = members[c, 2]
-        m = members[c, 3]
-        e = points[j] - points[i]
-        a = points[k] - points[i]
-        b = points[m] - points[i]
-        p, q = np.cross(e, a), np.cross(b, e)
-        ee, size = (e * e).sum(), np.sqrt((p * p).sum() * (q * q).sum())
+        at = row_of(points, members[c, 0])
+        e = corner_from(points, members[c, 1], at)
+        a = corner_from(points, members[c, 2], at)
+        b = corner_from(points, members[c, 3], at)
+        p, q = cross(e, a), cross(b, e)
+        ee, size = dot(e, e), np.sqrt(dot(p, p) * dot(q, q))
         if size <= TINY * ee * ee:
             out[c, 0], out[c, 1] = 1.0, 0.0
             continue
-        out[c, 0] = (p * q).sum() / size
+        out[c, 0] = dot(p, q) / size
         # sin t = -|e| a . q / (|p| |q|): as short as (p x q) . e with its three norms
-        out[c, 1] = -(a * q).sum() * np.sqrt(ee) / size
+        out[c, 1] = -dot(a, q) * np.sqrt(ee) / size
 
 
 @loop

@@ -153,7 +153,9 @@ def _find_foot(point, vertex, skin):
     """
     vertices, faces, start, ring = skin
     least, face = np.inf, -1
-    best, way, true = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    best = 0.0, 0.0, 0.0
+    way = 0.0, 0.0, 0.0
+    true = 0.0, 0.0, 0.0
     for r in range(start[vertex], start[vertex + 1]):
         f = ring[r]
         a = row_of(vertices, faces[f, 0])
@@ -174,7 +176,8 @@ def _find_foot(point, vertex, skin):
             true = plus(true, outward) if same else outward
         if squared < least:
             least, face = squared, f
-            best, way = weights, here
+            best = weights
+            way = here
     return least, face, best, way, true
 
 

@@ -18,7 +18,13 @@ from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.rest import PBDOptions, RestState, edge_stiffness
 from pbd_baseline.topology import Topology, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.frames import quaternion_matrix, rotate, turned_quaternions
+from rbfmuscle.geometry.frames import (
+    divided,
+    dot,
+    quaternion_matrix,
+    rotate,
+    turned_quaternions,
+)
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.loops import loop
@@ -96,10 +102,8 @@ def _turn_towards(moment, q):
         for n in range(3):
             b[m, n] = r[0][m] * moment[0, n] + r[1][m] * moment[1, n] + r[2][m] * moment[2, n]
     trace = b[0, 0] + b[1, 1] + b[2, 2]
-    vx = b[2, 1] - b[1, 2]
-    vy = b[0, 2] - b[2, 0]
-    vz = b[1, 0] - b[0, 1]
-    size = abs(trace) + abs(vx) + abs(vy) + abs(vz)
+    v = b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1]
+    size = abs(trace) + abs(v[0]) + abs(v[1]) + abs(v[2])
     if size <= 0.0:
         return 0.0
     xx = trace - b[0, 0]
@@ -110,38 +114,32 @@ def _turn_towards(moment, q):
     yz = -0.5 * (b[1, 2] + b[2, 1])
     first, second = xx * yy - xy * xy, yy * zz - yz * yz
     third, fourth = xy * yz - xz * yy, xy * xz - xx * yz
+    fifth = xz * yz - xy * zz
+    sixth = xx * zz - xz * xz
     det = zz * first + xz * third + yz * fourth
     if xx > 1e-6 * size and first > 1e-12 * size * size and det > 1e-18 * size * size * size:
-        ox = (second * vx + (xz * yz - xy * zz) * vy + third * vz) / det
-        oy = ((xz * yz - xy * zz) * vx + (xx * zz - xz * xz) * vy + fourth * vz) / det
-        oz = (third * vx + fourth * vy + first * vz) / det
+        adjugate = (second, fifth, third), (fifth, sixth, fourth), (third, fourth, first)
+        step = dot(adjugate[0], v), dot(adjugate[1], v), dot(adjugate[2], v)
+        step = divided(step, det)
     else:
-        ox = vx / size
-        oy = vy / size
-        oz = vz / size
-    square = ox * ox + oy * oy + oz * oz
+        step = divided(v, size)
+    square = dot(step, step)
     if square > 1.0:
-        ox = ox / np.sqrt(square)
-        oy = oy / np.sqrt(square)
-        oz = oz / np.sqrt(square)
-    _turn_quaternion(q, 0.5 * ox, 0.5 * oy, 0.5 * oz)
-    return square
-
-
-@loop
-def _turn_quaternion(q, x, y, z):
-    """q <- q (1, x, y, z), normalised: right to third order, and the fixed point is unchanged."""
-    a = q[0]
-    b = q[1]
-    c = q[2]
-    d = q[3]
-    q[0] = a - b * x - c * y - d * z
-    q[1] = b + a * x + c * z - d * y
-    q[2] = c + a * y + d * x - b * z
-    q[3] = d + a * z + b * y - c * x
-    size = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+        step = divided(step, np.sqrt(square))
+    # q <- q (1, step / 2), normalised: right to third order, and the fixed point is unchanged.
+    x = 0.5 * step[0]
+    y = 0.5 * step[1]
+    z = 0.5 * step[2]
+    turned = (
+        q[0] - q[1] * x - q[2] * y - q[3] * z,
+        q[1] + q[0] * x + q[2] * z - q[3] * y,
+        q[2] + q[0] * y + q[3] * x - q[1] * z,
+        q[3] + q[0] * z + q[1] * y - q[2] * x,
+    )
+    length = np.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2 + turned[3] ** 2)
     for k in range(4):
-        q[k] /= size
+        q[k] = turned[k] / length
+    return square
 
 
 @loop

@@ -46,7 +46,8 @@ class Topology:
         source, target = np.concatenate([edges, edges[:, ::-1]]).T
         order = np.lexsort((target, source))
         ring_start = np.searchsorted(source[order], np.arange(len(vertices) + 1))
-        ring, ring_edge = np.ascontiguousarray(target[order]), order % len(edges)
+        ring = np.ascontiguousarray(target[order])
+        ring_edge = order % len(edges)
         lonely = np.flatnonzero(np.diff(ring_start) == 0)
         if len(lonely):
             raise MeshError(
@@ -64,7 +65,8 @@ class Topology:
 
 
 def _edges_and_wings(faces):
-    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    tail = faces.ravel()
+    head = np.roll(faces, -1, axis=1).ravel()
     if (tail == head).any():
         raise MeshError("the muscle has a face that uses one vertex twice")
     opposite = opposite_half_edges(faces)

@@ -352,7 +352,8 @@ def vertex_rings(faces: Integers, opposite: Integers, count: int) -> tuple[Integ
         now = beside[now]
         going = now != first[walks]
         walks, now = walks[going], now[going]
-    row, step = np.concatenate(rows), np.concatenate(steps)
+    row = np.concatenate(rows)
+    step = np.concatenate(steps)
     whole = (np.bincount(row, minlength=count) == used)[row]
     row, step = row[whole], step[whole]
     order = np.argsort(row, kind="stable")

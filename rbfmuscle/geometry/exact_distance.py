@@ -131,7 +131,8 @@ def nearest_in_frame(bx, cx, cy, inverse_bc, inverse_ca, x, y):
 @loop
 def nearest_weights(p, a, b, c):
     """Barycentric weights of the point of a triangle nearest to p (Ericson 2005, section 5.1.5)."""
-    to_b, to_c = minus(b, a), minus(c, a)
+    to_b = minus(b, a)
+    to_c = minus(c, a)
     way = minus(p, a)
     d1, d2 = dot(to_b, way), dot(to_c, way)
     if d1 <= 0.0 and d2 <= 0.0:
@@ -272,7 +273,8 @@ class ExactDistance:
             raise ValueError(f"reach must be above zero, got {reach}")
         near = np.full(len(points), -1)
         distance = self.unsigned(points, near, reach)
-        closest, normal = np.empty_like(points), np.empty_like(points)
+        closest = np.empty_like(points)
+        normal = np.empty_like(points)
         normals = (*self.pseudonormals, self.faces, self.tree.order)
         _side_loop(points, self.tree, normals, near, distance, closest, normal)
         return distance, closest, np.where(near < 0, -1, self.tree.order[near]), normal
@@ -424,20 +426,13 @@ def nearest_triangle(tree, at, best, square, slack, stack):
         top -= 1
         if squares[top + 1] > square * (1.0 + slack):
             continue
-        while node < leaves:
+        if node < leaves:
             left = box_square(boxes, 2 * node, x, y, z)
             right = box_square(boxes, 2 * node + 1, x, y, z)
-            node = 2 * node
-            far, other = right, node + 1
-            if right < left:
-                far, other = left, node
-                node += 1
-            if far <= square * (1.0 + slack):
-                top += 1
-                nodes[top], squares[top] = other, far
-            if min(left, right) > square * (1.0 + slack):
-                break
-        if node < leaves:
+            near = 2 * node + 1 if right < left else 2 * node
+            nodes[top + 1], squares[top + 1] = 4 * node + 1 - near, max(left, right)
+            nodes[top + 2], squares[top + 2] = near, min(left, right)
+            top += 2
             continue
         for n in range(starts[node - leaves], starts[node - leaves + 1]):
             d = record_square(records, n, x, y, z)
@@ -498,9 +493,11 @@ def feature_normal(normals, records, n, feature):
     are those of the edges and vertices, the faces, and the face of each record.
     """
     edge_normals, vertex_normals, faces, order = normals
-    first = int(records[n, FIRST])
     if feature == FACE:
         return records[n, 9], records[n, 10], records[n, 11]
+    face = order[n]
+    first = int(records[n, FIRST])
     if feature < CORNER:
-        return row_of(edge_normals[order[n]], (first + feature - EDGE) % 3)
-    return row_of(vertex_normals, faces[order[n], (first + feature - CORNER) % 3])
+        k = (first + feature - EDGE) % 3
+        return edge_normals[face, k, 0], edge_normals[face, k, 1], edge_normals[face, k, 2]
+    return row_of(vertex_normals, faces[face, (first + feature - CORNER) % 3])

@@ -19,7 +19,8 @@ def cotangent_laplacian(vertices: Floats, faces: Integers) -> sparse.csc_matrix:
     weights would leave [0, 1]; they are raised to a small positive share of the mean weight.
     """
     # The ends of the edge opposite to each corner of the faces.
-    i, j = np.roll(faces, -1, axis=1), np.roll(faces, -2, axis=1)
+    i = np.roll(faces, -1, axis=1)
+    j = np.roll(faces, -2, axis=1)
     u, v = vertices[i] - vertices[faces], vertices[j] - vertices[faces]
     twice_area = np.linalg.norm(np.cross(u, v), axis=2)
     cotangent = 0.5 * np.einsum("fki,fki->fk", u, v) / np.maximum(twice_area, 1e-300)
@@ -115,8 +116,10 @@ def exponential_loop(points, twists, out):
             first, half = np.sin(angle) / angle, np.sin(0.5 * angle) / angle
             second = 2.0 * half * half
             third = (1.0 - first) / square
-        turned, swept = cross(omega, point), cross(omega, velocity)
-        twice, swept_twice = cross(omega, turned), cross(omega, swept)
+        turned = cross(omega, point)
+        swept = cross(omega, velocity)
+        twice = cross(omega, turned)
+        swept_twice = cross(omega, swept)
         for a in range(3):
             out[n, a] = point[a] + velocity[a] + first * turned[a]
             out[n, a] += second * (twice[a] + swept[a])

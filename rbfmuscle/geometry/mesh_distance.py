@@ -189,7 +189,8 @@ def _above(at, vertices, faces, f, axes):
         a, b = faces[f, k], faces[f, (k + 1) % 3]
         if (vertices[a, v] <= y) == (vertices[b, v] <= y):
             continue
-        west, east = east, _met(vertices, a, b, y, axes)
+        west = east
+        east = _met(vertices, a, b, y, axes)
         found += 1
     if found < 2:
         return 0

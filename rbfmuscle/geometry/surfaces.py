@@ -341,21 +341,11 @@ class EdgeLengths:
         vectors = self._vectors @ now
         return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
-
-class EdgeStretch:
-    """Mean change of length (n,) of the edges about each vertex, relative to vertices (n, 3) and
-    faces (m, 3) at rest.
-    """
-
-    def __init__(self, rest: Floats, faces: Integers) -> None:
-        self._lengths = EdgeLengths(rest, faces)
-        self._ends = self._lengths.edges.T.ravel()
-        self._count = np.maximum(np.bincount(self._ends, minlength=len(rest)), 1)
-
-    def __call__(self, now: Floats) -> Floats:
-        """The change at vertices (n, 3)."""
-        change = self._lengths(now) - 1.0
-        return np.bincount(self._ends, np.tile(change, 2), len(now)) / self._count
+    def stretch(self, now: Floats) -> Floats:
+        """Mean change of length (n,) of the edges about each vertex at vertices (n, 3)."""
+        ends = self.edges.T.ravel()
+        change = np.bincount(ends, np.tile(self(now) - 1.0, 2), len(now))
+        return change / np.maximum(np.bincount(ends, minlength=len(now)), 1)
 
 
 @loop

@@ -9,7 +9,7 @@ from functools import lru_cache
 from heapq import heapify, heappop, heappush
 from itertools import pairwise
 from threading import Lock, local
-from typing import TypeVar
+from typing import TypeVar, cast
 
 from numba import config
 from threadpoolctl import LibController, ThreadpoolController
@@ -129,17 +129,17 @@ def in_stages(
     workers = thread_count()
     ready = [(-sum(sum(cost(item)) for item in group), k, -1) for k, group in enumerate(groups)]
     heapify(ready)
-    results: dict[tuple[int, int], Result] = {}
-    running: dict[Future, tuple[int, int]] = {}  # group, and item of its second stage or -1
+    results: dict[tuple[int, int], object] = {}
+    running: dict[Future[object], tuple[int, int]] = {}  # group, and item of its second stage or -1
     try:
         while ready or running:
             while ready and len(running) < workers:
                 _, number, part = heappop(ready)
+                pool = _pool(workers)
                 if part < 0:
-                    future = _pool(workers).submit(first, number)
+                    running[pool.submit(first, number)] = number, part
                 else:
-                    future = _pool(workers).submit(second, groups[number][part])
-                running[future] = number, part
+                    running[pool.submit(second, groups[number][part])] = number, part
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 number, part = running.pop(future)
                 found = future.result()
@@ -150,7 +150,10 @@ def in_stages(
                     heappush(ready, (-cost(item)[1], number, part))
     finally:
         wait(running)
-    return [[results[k, part] for part in range(len(group))] for k, group in enumerate(groups)]
+    return [
+        [cast(Result, results[k, part]) for part in range(len(group))]
+        for k, group in enumerate(groups)
+    ]
 
 
 def in_chunks(count: int, work: Callable[[int, int], object], *, least: int = LEAST_SHARE) -> None:

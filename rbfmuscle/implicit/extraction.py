@@ -29,8 +29,10 @@ LEAST_VALUE = 1e-6
 SEARCHED, MARGIN = 64, 0.075
 # Newton steps towards the zero set, at most.
 NEWTON = 6
-# A vertex farther than this from the cut, in cells, stays clear of it; how far it is asked for.
-NEAR_CUT, REACH = 1.2, 1.25
+# A vertex farther than this from the cut, in cells, stays clear of it.
+NEAR_CUT = 1.2
+# Cells beyond which a lower bound of the distance to the cut will do: no vertex gets there.
+REACH = 1.25
 
 
 @dataclass(frozen=True)
@@ -195,8 +197,7 @@ class ExtractedSurface:
     volume that it holds.
 
     ``level`` is that of the field that was extracted, ``components`` the number of sheets in the
-    box, of which all but the one nearest to the points are left out, ``spacing`` the edge of a grid
-    cell [scene unit].
+    box, of which all but the one nearest to the points are left out.
     """
 
     vertices: np.ndarray
@@ -204,7 +205,6 @@ class ExtractedSurface:
     level: float
     volume: float
     components: int
-    spacing: float
 
 
 def extract_surface(
@@ -385,7 +385,6 @@ def _finish(
     sheets: int,
     bones: Obstacles,
 ) -> ExtractedSurface:
-    spacing = projector.spacing
     projector.push_off(faces, bones)
     if target is not None:
         step = projector.volume_step(faces, target, steps=3)
@@ -393,7 +392,7 @@ def _finish(
         projector.shift(step)
     vertices = projector.vertices
     check_finite(vertices, name="extracted vertices")
-    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), sheets, spacing)
+    return ExtractedSurface(vertices, faces, level, mesh_volume(vertices, faces), sheets)
 
 
 def _sheet_at(

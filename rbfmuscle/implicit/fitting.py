@@ -218,7 +218,8 @@ def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> F
     directions, inverse, complete = _orthonormal(basis.polynomials * units)
     if fits == 1 and not complete:
         return None
-    weights, coefficients = np.empty((fits, size)), np.empty((fits, q))
+    weights = np.empty((fits, size))
+    coefficients = np.empty((fits, q))
     conditions = np.empty(fits)
 
     def work(start: int, stop: int) -> None:

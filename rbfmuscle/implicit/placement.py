@@ -115,7 +115,8 @@ def cluster_mesh(
 ) -> tuple[Integers, Integers]:
     """Cells of equal ``density`` times area, and the triangulation dual to them."""
     weight = fine.area * density
-    start, tail, other = fine.start, fine.tail, fine.other
+    start, tail = fine.start, fine.tail
+    other = fine.other
     stretch = np.sqrt(density)
     length = fine.length * 0.5 * (stretch[tail] + stretch[other])
     used = np.flatnonzero(np.diff(start) > 0)

@@ -18,7 +18,7 @@ import rbfmuscle
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
 from rbfmuscle.folders import OutputFolder, write_whole
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
-from rbfmuscle.geometry.surfaces import EdgeStretch, simplified
+from rbfmuscle.geometry.surfaces import EdgeLengths, simplified
 from rbfmuscle.geometry.threads import each, thread_count
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.summary import QuantityFacts
@@ -47,17 +47,17 @@ class VertexArrays:
     def __init__(self, groups: Mapping[str, str]) -> None:
         numbers = sorted(set(groups.values()))
         self._groups = {name: float(numbers.index(group)) for name, group in groups.items()}
-        self._first: dict[str, tuple[Integers, EdgeStretch]] = {}
+        self._first: dict[str, tuple[Integers, EdgeLengths]] = {}
 
     def of(self, muscle: str, mesh: Mesh, distance: Floats | None) -> dict[str, Floats]:
         """Arrays (n,) of a muscle; no distance where no bone is in reach."""
         vertices, faces = mesh
         if muscle not in self._first:
-            self._first[muscle] = faces, EdgeStretch(*mesh)
-        first, stretch = self._first[muscle]
+            self._first[muscle] = faces, EdgeLengths(*mesh)
+        first, lengths = self._first[muscle]
         found = {"group": np.full(len(vertices), self._groups[muscle])}
         if faces is first or np.array_equal(faces, first):
-            found["stretch"] = stretch(vertices)
+            found["stretch"] = lengths.stretch(vertices)
         if distance is not None:
             found["bone_distance"] = distance
         return found

@@ -140,7 +140,8 @@ def _part_loop(vertices, faces, pairs, directions, inwards, most, parted, smooth
     ``most``: ``parted`` (n, 3). Pairs that share a corner go by a share of ``inwards`` (n, 3):
     ``smoothed`` (n, 3). At a corner the pair counts that goes farthest.
     """
-    corners, steps, ways = np.empty((6, 3)), np.empty((6, 3)), np.empty((6, 3))
+    corners, ways = np.empty((6, 3)), np.empty((6, 3))
+    steps = np.empty((6, 3))
     both = np.arange(6).reshape(2, 3)
     for k in range(len(pairs)):
         shared = False

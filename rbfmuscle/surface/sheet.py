@@ -133,22 +133,15 @@ class ShownBones:
         """
         unbounded = np.full(len(points), -np.inf)
         for bone, memory in enumerate(self._memories):
-            least, _ = self._ask(bone, points, unbounded, memory)
+            asked = self._bones[bone], self._poses[bone]
+            least, _ = distances(*asked, points, unbounded, memory)
             stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
             known = memory.some(stale)
-            least[stale], _ = self._ask(bone, points[stale], self._reach[stale], known)
+            least[stale], _ = distances(*asked, points[stale], self._reach[stale], known)
             for part, values in zip(memory, known):
                 part[stale] = values
             self._near[bone] = np.flatnonzero(least < self._reach)
             self._known[bone] = memory.some(self._near[bone])
-
-    def _ask(
-        self, bone: int, points: Floats, reach: Floats, known: Memory
-    ) -> tuple[Floats, Floats]:
-        """Distances (k,) of points (k, 3) to one bone and the directions (k, 3) in which they grow;
-        beyond ``reach`` (k,) lower bounds, without a direction.
-        """
-        return distances(self._bones[bone], self._poses[bone], points, reach, known)
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
@@ -164,7 +157,9 @@ class ShownBones:
                 some, known = rows, self._memories[bone].some(rows)
             for _ in range(LIFTS):
                 points = sheet.vertices[some]
-                distance, outward = self._ask(bone, points, np.zeros(len(some)), known)
+                distance, outward = distances(
+                    self._bones[bone], self._poses[bone], points, np.zeros(len(some)), known
+                )
                 inside = np.flatnonzero(distance < -OUT * self._shown.edge)
                 if len(inside) == 0:
                     break

@@ -11,7 +11,7 @@ import trimesh
 
 from rbfmuscle.geometry.arrays import Floats, Integers, to_world
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import EdgeStretch, clustered, joined_meshes, mesh_volume
+from rbfmuscle.geometry.surfaces import EdgeLengths, clustered, joined_meshes, mesh_volume
 from rbfmuscle.metrics.rows import surface_depth
 from rbfmuscle.run.appearance import (
     BONE_COLOUR,
@@ -162,7 +162,7 @@ def vertex_values(
     if colouring == "activation":
         return np.full(len(vertices), picture.activation.get(name, np.nan))
     if colouring == "stretch" and np.array_equal(faces, rest.surfaces[name][1]):
-        return EdgeStretch(*rest.surfaces[name])(vertices)
+        return EdgeLengths(*rest.surfaces[name]).stretch(vertices)
     if colouring == "penetration":
         return surface_depth(vertices, probes, picture.poses)
     if colouring == "distance" and other is not None:
