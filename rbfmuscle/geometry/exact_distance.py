@@ -477,9 +477,9 @@ def _side_loop(points, tree, normals, near, distance, closest, normal):
         x, y, z = row_of(points, i)
         (u, v), (du, dv, _), feature = offset_in_frame(tree.records, n, x, y, z)
         outward = feature_normal(normals, tree.records, n, feature)
+        record = tree.records[n]
         side = 0.0
         for k in range(3):
-            record = tree.records[n]
             closest[i, k] = record[k] + (u - du) * record[3 + k] + (v - dv) * record[6 + k]
             normal[i, k] = outward[k]
             side += (points[i, k] - closest[i, k]) * outward[k]
