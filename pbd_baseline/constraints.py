@@ -9,8 +9,6 @@ inverse mass, 0 where a vertex is held; constraints between held vertices alone 
 Dihedral angles of one colour are gathered in blocks and projected by vector instructions.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from pbd_baseline.topology import ONE, THREE, TWO, colour, members_in_order
@@ -18,24 +16,10 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import cross, dot, row_of
 from rbfmuscle.geometry.surfaces import corner_from, triangle_plane, volume_cubic, volume_loop
 from rbfmuscle.loops import loop
-from rbfmuscle.simulation.contact import BoneContacts
+from rbfmuscle.simulation.contact import NO_FENCES, BoneContacts, Fences
 
 # A half-space counts as violated below this share of the search reach.
 TOUCHING = 1e-9
-
-
-class ContactPlanes(NamedTuple):
-    """Half-spaces that c vertices are kept in, linearised where the contacts were asked."""
-
-    point: np.ndarray  # (c,) vertex
-    gap: np.ndarray  # (c,) distance there [scene unit]
-    normal: np.ndarray  # (c, 3)
-    anchor: np.ndarray  # (c, 3)
-
-
-NO_PLANES = ContactPlanes(
-    np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
-)
 
 
 class ContactConstraint:
@@ -47,12 +31,12 @@ class ContactConstraint:
 
     def __init__(self, *, reach: float) -> None:
         self.reach = float(reach)
-        self.planes = NO_PLANES
+        self.planes = NO_FENCES
 
     def find(self, contacts: BoneContacts, points: Floats, *, reach: float | None = None) -> float:
         """Ask the contacts where the vertices (n, 3) are now; return the greatest depth."""
         found = contacts.half_spaces(points, self.reach if reach is None else reach)
-        self.planes = ContactPlanes(*found[:3], points[found.point])
+        self.planes = Fences(*found[:3], points[found.point])
         return self.depth(points)
 
     def depth(self, points: Floats) -> float:
@@ -175,9 +159,7 @@ class VolumeConstraint:
         _volume_gradient_loop(points, self.faces, out)
         return out
 
-    def restore(
-        self, points: Floats, direction: Floats, planes: ContactPlanes = NO_PLANES
-    ) -> float:
+    def restore(self, points: Floats, direction: Floats, planes: Fences = NO_FENCES) -> float:
         """Move points along a direction (n, 3) until the volume is the rest volume; return the
         factor s.
 

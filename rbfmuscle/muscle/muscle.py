@@ -22,11 +22,11 @@ from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts, Fences
+from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts
 from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
 from rbfmuscle.simulation.touching import Body, surface_points
-from rbfmuscle.solid.contact import NO_FENCES, Obstacles
+from rbfmuscle.solid.contact import Obstacles
 from rbfmuscle.solid.kernels import turned_normals
 from rbfmuscle.solid.lattice import Lattice
 from rbfmuscle.solid.material import Material
@@ -148,8 +148,7 @@ class RBFMuscle:
         if self._met is None or self._met[0] is not contacts:
             self._met = contacts, self._obstacles(contacts)
         obstacles = self._met[1]
-        fences = contacts.fences
-        obstacles.fences = Fences(*map(np.concatenate, zip(*fences))) if fences else NO_FENCES
+        obstacles.fences = contacts.fences
         return Settling(
             self.model,
             self._most,

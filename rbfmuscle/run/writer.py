@@ -209,7 +209,7 @@ class RunWriter:
                 # Distances to bones that the muscle can reach, and what its model adds, as
                 # ``level_offset``.
                 if bones is not None and bones.names:
-                    distance = bones.distance(meshes[name][0], frame.poses, self._farthest)
+                    distance, _ = bones.nearest(meshes[name][0], frame.poses, self._farthest)
                     distance = np.minimum(distance, self._farthest)
                 arrays = self._arrays.of(name, meshes[name], distance)
                 arrays |= dict(frame.surfaces[name].arrays)

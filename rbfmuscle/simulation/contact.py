@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from rbfmuscle.bones.distance import Memory
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.scene.tendons import AT_REST
 from rbfmuscle.validation import check_finite, check_points
@@ -35,14 +35,18 @@ class HalfSpaces(NamedTuple):
 
 
 class Fences(NamedTuple):
-    """Half-spaces that hold contact points on their side of a bone that they would pass through,
-    fixed through a sub-step.
+    """Half-spaces that stay where they are while the contact points move: those that hold points on
+    their side of a bone that they would pass through, fixed through a sub-step, or contacts as they
+    were when they were asked for.
     """
 
-    point: Integers  # (f,)
+    point: Integers  # (f,) number of the contact point
     gap: Floats  # (f,) distance of the anchor [scene unit]
     normal: Floats  # (f, 3) unit
     anchor: Floats  # (f, 3)
+
+
+NO_FENCES = Fences(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 # Grows a box so far that it holds all that can be near the bone in it.
@@ -83,12 +87,6 @@ class BonesInReach:
                 raise ValueError(f"poses lack the bone {name!r}") from None
         return out
 
-    def distance(
-        self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
-    ) -> Floats:
-        """Smallest distance (n,) over the bones; parameters and result as for `nearest`."""
-        return self.nearest(points, poses, limit)[0]
-
     def nearest(
         self, points: ArrayLike, poses: Mapping[str, Floats], limit: Floats | float = np.inf
     ) -> tuple[Floats, Floats]:
@@ -126,8 +124,9 @@ class BoneContacts:
         #: Displacements (n, 3) that take shown points (n, 3) of the muscle out of its neighbours.
         self.out_of_neighbours: Callable[[Floats], Floats] = np.zeros_like
         #: What holds points on their side of a bone, in a sub-step that needs it.
-        self.fences: list[Fences] = []
+        self.fences = NO_FENCES
         self._free = np.flatnonzero(self.free)
+        #: How deep (r, n) each contact point may be inside each bone in reach [scene unit].
         self.allowed = np.zeros((len(bones.names), len(self.free)))
         #: What is known of the free points about each bone in reach.
         self.memories = [Memory.of(len(self._free)) for _ in bones.names]
@@ -136,15 +135,6 @@ class BoneContacts:
         """Take the bones' poses, a dict of bone name to (4, 4) rest-to-world transform."""
         self.bones.place(poses, self.placed)
         self.poses = poses
-
-    def allow(self, row: int, depth: Floats) -> None:
-        """Let each contact point be up to ``depth`` (n,) inside a bone in reach [scene unit]."""
-        self.allowed[row] = depth
-
-    @property
-    def keeps_overlap(self) -> Booleans:
-        """Which contact points (n,) are allowed in a bone."""
-        return np.asarray((self.allowed > 0.0).any(axis=0))
 
     def distance_and_direction(self, points: Floats, row: int) -> tuple[Floats, Floats]:
         """Signed distance (n,) to one of the bones in reach and the unit direction (n, 3) in which
@@ -170,7 +160,7 @@ class BoneContacts:
             )
         check_finite(points, name="points")
         some = points[self._free]
-        found = [NO_SPACES]
+        found = []
         for row in self._near(some, reach):
             allowed = self.allowed[row, self._free]
             distance, normal = self._ask(row, some, reach - allowed)
@@ -178,12 +168,12 @@ class BoneContacts:
             near = np.flatnonzero(gap < reach)
             source = np.full(len(near), row)
             found.append(HalfSpaces(self._free[near], gap[near], normal[near], source))
-        for fences in self.fences:
-            away = points[fences.point] - fences.anchor
-            gap = fences.gap + np.einsum("ij,ij->i", fences.normal, away)
-            near = np.flatnonzero(gap < reach)
-            source = np.full(len(near), -1)
-            found.append(HalfSpaces(fences.point[near], gap[near], fences.normal[near], source))
+        fences = self.fences
+        away = points[fences.point] - fences.anchor
+        gap = fences.gap + np.einsum("ij,ij->i", fences.normal, away)
+        near = np.flatnonzero(gap < reach)
+        source = np.full(len(near), -1)
+        found.append(HalfSpaces(fences.point[near], gap[near], fences.normal[near], source))
         return HalfSpaces(*map(np.concatenate, zip(*found)))
 
     def lifted(self, points: Floats) -> Floats:
@@ -214,8 +204,3 @@ class BoneContacts:
         """Distances and directions of all free points; what is known of them is kept."""
         field, memory = self.bones.fields[row], self.memories[row]
         return field.distance_and_gradient(points, self.placed[row], reach=reach, memory=memory)
-
-
-NO_SPACES = HalfSpaces(
-    np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)
-)

@@ -17,13 +17,13 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import step_angle
+from rbfmuscle.simulation.contact import NO_FENCES, Fences
 from rbfmuscle.simulation.neighbours import Link, Neighbours, NeighbourState
 from rbfmuscle.simulation.stepper import MuscleStepper, Path, StepperState
+from rbfmuscle.simulation.substeps import Coordinates
 from rbfmuscle.simulation.touching import settle
 from rbfmuscle.simulation.tunnelling import Crossing, one_sided_planes
 from rbfmuscle.validation import NotFiniteError, SolveError
-
-Coordinates = dict[str, float]
 
 # Rounds in which points that still cross at the smallest step are held by planes.
 FENCES = 4
@@ -32,11 +32,8 @@ SMALLEST_STEP = math.radians(0.1)
 FAILURES = np.linalg.LinAlgError, FloatingPointError, NotFiniteError
 
 
-class GroupState(NamedTuple):
-    """What changes of a group between sub-steps."""
-
-    steppers: list[StepperState]
-    neighbours: NeighbourState
+# What changes of a group between sub-steps.
+GroupState = tuple[list[StepperState], NeighbourState]
 
 
 class Saved(NamedTuple):
@@ -102,7 +99,12 @@ class Group:
         if self.detects == "off":
             self._follow(path)
             return
-        saved = self._save()
+        models = [stepper.model for stepper in self.steppers]
+        saved = Saved(
+            [model.snapshot() for model in models],
+            [model.contact_points().copy() for model in models],
+            self.neighbours.state,
+        )
         self._follow(path)
         crossings = [
             stepper.crossings(path, start) for stepper, start in zip(self.steppers, saved.points)
@@ -146,19 +148,13 @@ class Group:
 
     def snapshot(self) -> GroupState:
         """The state, for :meth:`restore`."""
-        steppers = [stepper.snapshot() for stepper in self.steppers]
-        return GroupState(steppers, self.neighbours.state)
+        return [stepper.snapshot() for stepper in self.steppers], self.neighbours.state
 
     def restore(self, state: GroupState) -> None:
         """Return to a snapshot, which stays valid."""
-        for stepper, known in zip(self.steppers, state.steppers):
+        steppers, self.neighbours.state = state
+        for stepper, known in zip(self.steppers, steppers):
             stepper.restore(known)
-        self.neighbours.state = state.neighbours
-
-    def _save(self) -> Saved:
-        models = [stepper.model for stepper in self.steppers]
-        points = [model.contact_points().copy() for model in models]
-        return Saved([model.snapshot() for model in models], points, self.neighbours.state)
 
     def _take_back(self, saved: Saved) -> None:
         for stepper, state in zip(self.steppers, saved.models):
@@ -199,10 +195,13 @@ class Group:
         try:
             for _ in range(FENCES):
                 for stepper, found, start in zip(self.steppers, crossings, saved.points):
-                    stepper.contacts.fences += [
-                        one_sided_planes(stepper.contacts, crossing, start, path.old, path.new)
+                    contacts = stepper.contacts
+                    planes = [
+                        one_sided_planes(contacts, crossing, start, path.old, path.new)
                         for crossing in found
                     ]
+                    parts = zip(contacts.fences, *planes)
+                    contacts.fences = Fences(*map(np.concatenate, parts))
                 self._take_back(saved)
                 self._follow(path)
                 for stepper, found in zip(self.steppers, crossings):
@@ -215,7 +214,7 @@ class Group:
                     break
         finally:
             for stepper in self.steppers:
-                stepper.contacts.fences = []
+                stepper.contacts.fences = NO_FENCES
         return crossings
 
 

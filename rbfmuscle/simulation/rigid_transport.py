@@ -35,11 +35,12 @@ class MuscleStatus(NamedTuple):
 
 
 class RigidState(NamedTuple):
-    """What changes of a `RigidTransport`."""
+    """What changes of a `RigidTransport`; nothing in it is changed in place."""
 
-    solved: Floats | None  # (b, 4, 4)
-    since: Floats  # (4, 4)
-    moved: bool
+    # (b, 4, 4) poses of what holds the muscle when it was solved last, None where it never was
+    solved: Floats | None
+    since: Floats  # (4, 4) the rigid motion since its surface was drawn last
+    moved: bool  # whether it was moved since the last `collect`
 
 
 class RigidTransport:
@@ -47,8 +48,7 @@ class RigidTransport:
     nor contracts.
 
     ``names`` holds the b bones, and ends of tendons, that hold it, first that of most of it;
-    ``solved`` (b, 4, 4) their poses when it was solved last, or None; ``since`` the rigid motion
-    (4, 4) since its surface was drawn last.
+    ``state`` is its own snapshot.
     """
 
     def __init__(self, muscle: Muscle, scene: Scene) -> None:
@@ -66,16 +66,16 @@ class RigidTransport:
         # All that holds it, as seen from the first, and the first as seen from another bone.
         self._apart = _at_rest(np.arange(1, count), corners[1:], ARC * size, count)
         self._whole = _at_rest(np.array([1]), corners[:1], ARC * size, 2)
-        self.solved: Floats | None = None
-        self.since, self.moved = IDENTITY, False
+        self.state = RigidState(None, IDENTITY, False)
 
     def keeps_shape(self, after: Mapping[str, Floats]) -> bool:
         """Whether the bones that hold the muscle stand to each other as when it was solved last."""
-        return self.solved is None or self._stand_alike(self.solved, self._stacked(after))
+        solved = self.state.solved
+        return solved is None or self._stand_alike(solved, self._stacked(after))
 
     def note_solved(self, poses: Mapping[str, Floats]) -> None:
         """Take the poses in which the muscle was solved."""
-        self.solved = self._stacked(poses)
+        self.state = self.state._replace(solved=self._stacked(poses))
 
     def try_carry(
         self,
@@ -87,9 +87,9 @@ class RigidTransport:
         """Move the muscle rigidly from one set of poses to the next if it need not be solved;
         return whether it was. Where it was not, it is taken to be solved there.
         """
-        new = self._stacked(after)
-        old = self._stacked(before) if self.solved is None else self.solved
-        self.solved = new
+        new, known = self._stacked(after), self.state
+        old = self._stacked(before) if known.solved is None else known.solved
+        self.state = known._replace(solved=new)
         if not self._stand_alike(old, new):
             return False
         # No other bone may come near.
@@ -110,22 +110,14 @@ class RigidTransport:
             model.restore(saved)
             contacts.move(before)
             return False
-        self.solved = old
-        if moves:
-            self.since, self.moved = motion @ self.since, True
+        since = motion @ known.since if moves else known.since
+        self.state = RigidState(old, since, moves or known.moved)
         return True
-
-    def snapshot(self) -> RigidState:
-        """The state, for :meth:`restore`."""
-        return RigidState(self.solved, self.since, self.moved)
-
-    def restore(self, state: RigidState) -> None:
-        """Return to a snapshot."""
-        self.solved, self.since, self.moved = state
 
     def collect(self) -> bool:
         """Whether the muscle was moved since the last call."""
-        moved, self.moved = self.moved, False
+        moved = self.state.moved
+        self.state = self.state._replace(moved=False)
         return moved
 
     def _touches(self, model: MuscleModel, contacts: BoneContacts, bones: list[int]) -> bool:

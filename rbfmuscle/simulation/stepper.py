@@ -142,11 +142,13 @@ class MuscleStepper:
         started, rigid_transport = perf_counter(), self.rigid_transport
         shown = self._shown
         if shown is not None:
-            drawn = shown.moved(IDENTITY if rigid_transport is None else rigid_transport.since)
+            drawn = shown.moved(
+                IDENTITY if rigid_transport is None else rigid_transport.state.since
+            )
         else:
             drawn = self._shown = self.model.surface(self.contacts)
             if rigid_transport is not None:
-                rigid_transport.since = IDENTITY
+                rigid_transport.state = rigid_transport.state._replace(since=IDENTITY)
         self.times["time_surface"] += perf_counter() - started
         return drawn
 
@@ -193,11 +195,11 @@ class MuscleStepper:
 
     def snapshot(self) -> StepperState:
         """The state, for :meth:`restore`; times are none of it."""
-        contacts, rigid_transport = self.contacts, self.rigid_transport
+        rigid_transport = self.rigid_transport
         return StepperState(
             self.model.snapshot(),
-            contacts.poses,
-            None if rigid_transport is None else rigid_transport.snapshot(),
+            self.contacts.poses,
+            None if rigid_transport is None else rigid_transport.state,
             self._shown,
             dict(self.events),
             self.frame,
@@ -210,7 +212,7 @@ class MuscleStepper:
         self.model.restore(state.model)
         self.contacts.move(state.poses)
         if self.rigid_transport is not None and state.rigid_transport is not None:
-            self.rigid_transport.restore(state.rigid_transport)
+            self.rigid_transport.state = state.rigid_transport
         self._shown = state.shown
         self.events = dict(state.events)
         self.frame = state.frame
@@ -236,5 +238,5 @@ def keep_initial_overlap(stepper: MuscleStepper) -> None:
                 f"muscle {stepper.name!r} overlaps bone {bone!r} at rest: {int(deep.sum())} "
                 f"points, {depth.max():.3g} {scene.units} deep; set [contact] initial to 'keep'"
             )
-        contacts.allow(row, depth)
+        contacts.allowed[row] = depth
         stepper.report(bone, int(deep.sum()), "overlap_kept")

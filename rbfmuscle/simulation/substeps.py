@@ -86,7 +86,6 @@ class SubSteps:
         else:
             self.bones = [*dict.fromkeys([*own, *bones])]
             self.relevant = _moving_apart(scene, [*guides, *bones])
-        self._muscle = muscle
         self.limit = math.radians(scene.contact.substep_angle)
         # Of each attachment: its bone, a box about it, and how far that may move in one sub-step.
         frames = {part.name: RestFrame(np.asarray(part.mesh.vertices)) for part in muscles}

@@ -17,7 +17,7 @@ import numpy as np
 
 from rbfmuscle.bones.distance import distance_at
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_local
+from rbfmuscle.geometry.arrays import Floats, Integers, to_local
 from rbfmuscle.geometry.exact_distance import (
     BX,
     CX,
@@ -74,39 +74,36 @@ def find_crossings(
     crossings: list[Crossing] = []
     free = np.flatnonzero(contacts.free)
     start, end = start[free], end[free]
+    near = np.empty(len(free), dtype=np.bool_)
+    places = np.empty((len(free), 2))
+    cosine = np.empty(len(free))
     for row, (name, field) in enumerate(zip(contacts.bones.names, contacts.bones.fields)):
-        found = Paths.of(len(free))
         poses = (before[name], after[name])
-        path_loop(field.arrays, *poses, start, end, *contacts.memories[row], tolerance, *found)
+        path_loop(
+            field.arrays,
+            *poses,
+            start,
+            end,
+            *contacts.memories[row],
+            tolerance,
+            near,
+            places,
+            cosine,
+        )
         through = []
-        for k in np.flatnonzero(found.cosine < SLIDING_COSINE):
+        for k in np.flatnonzero(cosine < SLIDING_COSINE):
             first, last = to_local(start[k], poses[0]), to_local(end[k], poses[1])
-            entry, leave = first + found.places[k, :, None] * (last - first)
-            opposite = found.cosine[k] < OPPOSITE_COSINE
+            entry, leave = first + places[k, :, None] * (last - first)
+            opposite = cosine[k] < OPPOSITE_COSINE
             if opposite or _deepest(field, entry, leave, tolerance) > tolerance:
                 through.append(k)
         flags = 0
         if options.angle is not None:
-            near = np.flatnonzero(found.near)
             paths = to_local(start[near], poses[0]), to_local(end[near], poses[1])
             flags = count_flags(field, *paths, math.radians(options.angle))
         if through or flags:
             crossings.append(Crossing(row, free[np.array(through, dtype=np.int64)], flags))
     return crossings
-
-
-class Paths(NamedTuple):
-    """Paths of n points at a bone."""
-
-    near: Booleans  # (n,) whether they may touch it
-    # (n, 2) where they first go into it and last come out, as shares of each path
-    places: Floats
-    cosine: Floats  # (n,) between the outward directions there, 1 where a path does not meet it
-
-    @classmethod
-    def of(cls, count: int) -> "Paths":
-        """Of so many points, to be filled."""
-        return cls(np.empty(count, dtype=np.bool_), np.empty((count, 2)), np.empty(count))
 
 
 def _deepest(field: BoneSDF, start: Floats, end: Floats, tolerance: float) -> float:
@@ -184,8 +181,12 @@ def path_loop(
     places,
     cosine,
 ):
-    """Fill the `Paths` of points (n, 3) in world coordinates at a bone that goes between two poses
-    (4, 4); they are straight in its coordinates.
+    """Follow points (n, 3) in world coordinates at a bone that goes between two poses (4, 4), on
+    paths that are straight in its coordinates.
+
+    Filled are ``near`` (n,), whether they may touch it, ``places`` (n, 2), where they first go into
+    it and last come out, as shares of each path, and ``cosine`` (n,), that between the outward
+    directions there, 1 where a path does not meet it.
 
     A path that begins or ends inside goes in or comes out at its end, with the direction of the
     distance's gradient; where it meets no triangle, it counts as inside from the ``tolerance`` on.

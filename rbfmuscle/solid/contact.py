@@ -13,7 +13,7 @@ from rbfmuscle.bones.rounded import LEAST_SLOPE, RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
-from rbfmuscle.simulation.contact import Fences
+from rbfmuscle.simulation.contact import NO_FENCES
 from rbfmuscle.solid.kernels import add_rows
 
 MOST_ROWS = 800  # contact points whose rows are kept: more are found anew
@@ -29,9 +29,6 @@ class Touch(NamedTuple):
 
 
 NO_TOUCH = Touch(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
-
-
-NO_FENCES = Fences(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 class Obstacles:

@@ -189,7 +189,7 @@ class SurfaceBuilder:
             at_rest = np.tile(np.eye(4), (len(contacts.placed), 1, 1))
             resting = ShownBones(self.shown, contacts.bones, at_rest, self._grids)
             nearest = cKDTree(self.rest.points).query(self.shown.rest)[1]
-            kept = (self.rest.held_by >= 0) | contacts.keeps_overlap
+            kept = (self.rest.held_by >= 0) | (contacts.allowed > 0.0).any(axis=0)
             cleared = clear_rest(self.shown, resting, kept[nearest])
             if not np.array_equal(cleared, self.shown.rest):
                 self._take(cleared, self.shown.faces)

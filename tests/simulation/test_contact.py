@@ -56,11 +56,9 @@ def test_fences_come_behind_bones():
     contacts, _ = _pair()
     points, rng = _points(), np.random.default_rng(4)
     bones = len(contacts.half_spaces(points, 0.5).point)
-    wanted = []
-    for _ in range(2):
-        at, gap = rng.permutation(400)[:60], rng.normal(size=60)
-        contacts.fences.append(Fences(at, gap, rng.normal(size=(60, 3)), points[at]))
-        wanted += [(i, -1, g) for i, g in zip(at, gap) if g < 0.5]
+    at, gap = rng.permutation(400)[:60], rng.normal(size=60)
+    contacts.fences = Fences(at, gap, rng.normal(size=(60, 3)), points[at])
+    wanted = [(i, -1, g) for i, g in zip(at, gap) if g < 0.5]
     found = contacts.half_spaces(points, 0.5)
     rows = list(zip(found.point[bones:], found.source[bones:], found.gap[bones:]))
     assert rows == wanted and (found.source[:bones] >= 0).all()
@@ -82,7 +80,6 @@ def test_nearest_is_the_smallest_over_bones_and_infinite_without():
     assert 0 < below.sum() < len(points)
     assert np.array_equal(found[below], distance[below])
     assert np.array_equal(slope[below], gradient[below])
-    assert np.array_equal(bones.distance(points, poses, limit), found)
     assert np.all(found[~below] >= limit[~below]) and np.all(found <= distance + 1e-9)
 
 

@@ -119,7 +119,7 @@ def test_the_shape_at_rest_is_the_one_that_the_first_frame_found():
     drawn(np.eye(3))
     first = drawn.builder.shown.rest
     assert 0.0 < (first[:, 2] < -0.7 - 0.1 * EDGE).sum() < (X[:, 2] < -0.7 - 0.1 * EDGE).sum()
-    drawn.contacts.allow(0, np.full(len(CENTRES), 0.5))
+    drawn.contacts.allowed[0] = 0.5
     assert drawn(np.eye(3)).vertices[:, 2].min() > -0.7 - 1e-4 * EDGE
     np.testing.assert_array_equal(drawn.builder.shown.rest, first)
 
