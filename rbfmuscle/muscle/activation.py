@@ -64,22 +64,6 @@ def along_fibres(model: SolidModel, insertion: Booleans) -> Floats:
     return _gradient(model, share[:, 0] / share.sum(axis=1))
 
 
-def flux(model: SolidModel, insertion: Booleans) -> Floats:
-    """Gradient (Q, 3) of a potential whose flux from the points held at the origin to those at the
-    ``insertion`` (h,) is one.
-    """
-    source = np.where(insertion, 1.0 / max(insertion.sum(), 1), -1.0 / max((~insertion).sum(), 1))
-    right = model.hangs @ source
-    return _gradient(model, np.linalg.lstsq(model.matrix, right, rcond=None)[0])
-
-
-def fibre_stretches(model: SolidModel, nodes: Floats) -> Floats:
-    """Stretch against rest (Q,) along the fibres at the quadrature points for nodes (N, 3)."""
-    direction = model.fibres.direction
-    along = [(_gradient(model, nodes[:, axis]) * direction).sum(axis=1) for axis in range(3)]
-    return np.asarray(np.linalg.norm(along, axis=0))
-
-
 def _gradient(model: SolidModel, values: Floats) -> Floats:
     """Gradient (Q, 3) at the quadrature points of values (N,) at the nodes."""
     cells = model.cells
@@ -115,7 +99,9 @@ def descending_limb(model: SolidModel, nodes: Floats) -> float:
     """
     fibres = model.fibres
     weights = model.cells.weights * (fibres.active > 0.0)
-    lengths = 0.5 * fibre_stretches(model, nodes) / fibres.content
+    along = [(_gradient(model, column) * fibres.direction).sum(axis=1) for column in nodes.T]
+    # Against the slack length, from the stretch against rest.
+    lengths = 0.5 * np.linalg.norm(along, axis=0) / fibres.content
     x = max(1.0, float(weights @ lengths / weights.sum()))
     return max(0.0, 1.0 - ((x - 1.0) / 0.5) ** 2) / ((x - 0.5) / 0.5)
 
@@ -126,7 +112,9 @@ def fibre_density(model: SolidModel, belly: Booleans, insertion: Booleans) -> Fl
     They run as a flux without sources from one end to the other, spread evenly over both;
     ``insertion`` (h,) are the points held at the second.
     """
-    size = np.linalg.norm(flux(model, insertion), axis=1)
+    source = np.where(insertion, 1.0 / max(insertion.sum(), 1), -1.0 / max((~insertion).sum(), 1))
+    potential = np.linalg.lstsq(model.matrix, model.hangs @ source, rcond=None)[0]
+    size = np.linalg.norm(_gradient(model, potential), axis=1)
     order = np.argsort(size[belly], kind="stable")
     weight = np.cumsum(model.cells.weights[belly][order])
     widest = size[belly][order][np.searchsorted(weight, 0.5 * WIDEST * weight[-1])]

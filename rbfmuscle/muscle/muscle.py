@@ -17,7 +17,7 @@ from rbfmuscle.muscle.activation import (
     descending_limb,
     held_at_insertion,
 )
-from rbfmuscle.muscle.rest import LEAST_ATTACHED, RBFOptions, RestState
+from rbfmuscle.muscle.rest import LEAST_ATTACHED, RBFOptions, measure_rest
 from rbfmuscle.scene.joints import Joint
 from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
@@ -40,7 +40,7 @@ from rbfmuscle.solid.model import (
 )
 from rbfmuscle.solid.solve import NEAR, Settling
 from rbfmuscle.solid.state import SolidState, predict, rest_state, transform
-from rbfmuscle.surface.drawing import Carry, SurfaceBuilder
+from rbfmuscle.surface.drawing import Carry, RestState, SurfaceBuilder
 
 # Spacing of the points that meet neighbours, of the size, and how high the surface rises between.
 APART, RISES = 0.02, 4e-4
@@ -92,7 +92,7 @@ class RBFMuscle:
         self.name = muscle.name
         self._rest_mesh = muscle.mesh
         self.options = options or RBFOptions()
-        self.rest = RestState.from_muscle(muscle, scene, self.options)
+        self.rest = measure_rest(muscle, scene, self.options)
         fit = self.rest.fit
         self.epsilon = fit.epsilon if fit.kernel.has_epsilon else None
         self.frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
@@ -107,7 +107,7 @@ class RBFMuscle:
         self.drawer = SurfaceBuilder(
             muscle,
             scene,
-            self.rest.surface(),
+            self.rest,
             self._carry,
             shape=self.options.surface,
             resolution=self.options.resolution,

@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from dataclasses import replace
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -28,7 +28,7 @@ from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.options import NotNegative, Table
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.surface.drawing import RestSurface
+from rbfmuscle.surface.drawing import RestState
 from rbfmuscle.validation import NumericalWarning, SceneError, UsageError
 
 FEWEST_CENTRES = 4  # a linear polynomial in space has four coefficients
@@ -112,13 +112,6 @@ SEARCH = 4
 SEED = 0
 
 
-def default_centres(area: float, scene: Scene) -> int:
-    """Number of centres of a muscle of this area [scene unit squared]."""
-    return max(
-        LEAST_CENTRES, int(round(area / (AREA_FOR_EACH * from_mm(1.0, scene.units) ** 2), -1))
-    )
-
-
 def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
     """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its
     size.
@@ -129,30 +122,21 @@ def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
     return min(from_mm(REST_ERROR, scene.units), REST_SHARE * thickness)
 
 
-class Chosen(NamedTuple):
-    """Number of centres of a muscle, and why."""
-
-    centres: int
-    error: float  # of the surface at rest, RMS [scene unit]; NaN where nothing was fitted
-    reason: str
-
-
 def choose_centres(
     muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False
-) -> Chosen:
-    """How many centres a muscle has: as many as the scene says, else as its area and the error at
-    rest ask for.
+) -> tuple[int, str]:
+    """How many centres a muscle has, and why: as many as the scene says, else as its area and the
+    error at rest ask for.
 
     The number is kept on disk; with ``known_only`` nothing is fitted, and where it is not on disk
     it is the least that it can be.
     """
     if options.centres:
-        return Chosen(options.centres, np.nan, "as given")
-    usual, wanted = default_centres(muscle.mesh.area, scene), wanted_error(muscle, scene, options)
-    frame, faces = (
-        RestFrame(np.asarray(muscle.mesh.vertices, dtype=float)),
-        np.asarray(muscle.mesh.faces),
-    )
+        return options.centres, "as given"
+    area_for_each = AREA_FOR_EACH * from_mm(1.0, scene.units) ** 2
+    usual = max(LEAST_CENTRES, int(round(muscle.mesh.area / area_for_each, -1)))
+    wanted = wanted_error(muscle, scene, options)
+    frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
     fit = (
         get_kernel(options.kernel).identity,
         round(options.epsilon * frame.size, 9),
@@ -161,11 +145,13 @@ def choose_centres(
         SEED,
     )
     key = content_key(
-        frame.local, faces, ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit)
+        frame.local,
+        np.asarray(muscle.mesh.faces),
+        ("centres", SEARCH, usual, round(wanted / frame.size, 9), *fit),
     )
     found = load_arrays(key)
     if found is None and known_only:
-        return Chosen(usual, np.nan, "by its area; more where the rest error asks for them")
+        return usual, "by its area; more where the rest error asks for them"
     if found is None:
         count, error = _search_centres(muscle, frame, options, usual, wanted)
         found = {"count": np.array(count), "error": np.array(error / frame.size)}
@@ -173,9 +159,7 @@ def choose_centres(
     count, error = int(found["count"]), float(found["error"]) * frame.size
     how = "by its area" if count == usual else f"more than the {usual} of its area"
     met = "met" if error <= wanted else "not met"
-    return Chosen(
-        count, error, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}"
-    )
+    return count, f"{how}, rest error {error:.2g}, {wanted:.2g} {scene.units} wanted: {met}"
 
 
 def _search_centres(
@@ -296,123 +280,76 @@ def _refuse_broken(
 LEAST_ATTACHED = 4
 
 
-@dataclass(frozen=True)
-class RestState:
-    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the
-    surface.
+def measure_rest(muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
+    """Measure a muscle; SceneError if no centre is left free to move."""
+    frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
+    count, _ = choose_centres(muscle, scene, options)
+    centres, samples, fit = place_points(muscle, frame, options, count)
+    bones, attached_bone = _find_holders(muscle, scene, frame, centres.points, samples.points)
+    if (attached_bone[: len(centres.points)] >= 0).all():
+        raise SceneError(
+            f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is free to move"
+        )
+    return RestState(
+        frame.points(centres.points),
+        frame.directions(centres.normals),
+        frame.points(samples.points),
+        samples.control_faces,
+        fit,
+        fit.parts(centres.points),
+        bones,
+        attached_bone,
+        float(muscle.mesh.volume),
+        # Cells along the muscle's own axes are smaller than along the scene's, and turn with the
+        # scene.
+        frame.directions(principal_axes(samples.points)),
+    )
+
+
+def _find_holders(
+    muscle: Muscle, scene: Scene, frame: RestFrame, centres: Floats, samples: Floats
+) -> tuple[list[str], Integers]:
+    """The bones that hold a muscle, and which of them, by its position, holds each centre, then
+    each sample; -1 where none does.
     """
-
-    centres: np.ndarray  # (K, 3)
-    normals: np.ndarray  # (K, 3)
-    samples: np.ndarray  # (S, 3)
-    sample_faces: np.ndarray  # (m, 3) closed outward triangulation of the samples
-    fit: FieldFit  # how the field through the centres is fitted
-    parts: np.ndarray  # (P, n) centres of its local fits
-    bones: list[str]  # bones, and ends of tendons, that hold the muscle, by their names
-    attached_bone: (
-        np.ndarray
-    )  # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
-    mesh_volume: float  # of the muscle's mesh [scene unit cubed]
-    axes: np.ndarray  # (3, 3) principal axes as rows
-
-    @classmethod
-    def from_muscle(cls, muscle: Muscle, scene: Scene, options: RBFOptions) -> RestState:
-        """Measure a muscle; SceneError if no centre is left free to move."""
-        frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
-        count = choose_centres(muscle, scene, options).centres
-        centres, samples, fit = place_points(muscle, frame, options, count)
-        points = frame.points(centres.points)
-        held_by = _Attachment(muscle, scene, frame, centres.points, samples.points)
-        if (held_by.centres >= 0).all():
-            raise SceneError(
-                f"muscle {muscle.name!r}: every centre lies on an attachment; nothing is "
-                "free to move"
-            )
-        attached_bone = np.concatenate([held_by.centres, held_by.samples])
-        return cls(
-            points,
-            frame.directions(centres.normals),
-            frame.points(samples.points),
-            samples.control_faces,
-            fit,
-            fit.parts(centres.points),
-            held_by.bones,
-            attached_bone,
-            float(muscle.mesh.volume),
-            # Cells along the muscle's own axes are smaller than along the scene's, and turn with
-            # the scene.
-            frame.directions(principal_axes(samples.points)),
-        )
-
-    def surface(self) -> RestSurface:
-        """What the surface is drawn from."""
-        return RestSurface(
-            self.fit,
-            self.parts,
-            self.centres,
-            self.normals,
-            self.contact_points(),
-            self.attached_bone,
-            self.mesh_volume,
-            self.axes,
-            self.bones,
-        )
-
-    def contact_points(self) -> np.ndarray:
-        """Centres, then samples, (K + S, 3)."""
-        return np.concatenate([self.centres, self.samples])
+    names = sorted(attachment_frames(scene.bones, muscle))
+    patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
+    numbers = np.array(
+        [names.index(attachment.attachment_frame) for attachment in muscle.attachments]
+    )
+    owner = np.full(len(frame.local), -1)
+    for number, patch in zip(numbers, patches):
+        owner[patch] = number
+    used = np.unique(owner[owner >= 0])
+    place = np.full(len(names) + 1, -1)
+    place[used] = np.arange(len(used))
+    owner, numbers = place[owner], place[numbers]
+    tree = cKDTree(frame.local)
+    nearest = tree.query(centres)[1]
+    held_by = owner[nearest]
+    for number, patch in zip(numbers, patches):
+        if number >= 0 and np.isin(nearest, patch).sum() < LEAST_ATTACHED:
+            _claim(held_by, number, cKDTree(frame.local[patch]).query(centres)[0])
+    return [names[b] for b in used], np.concatenate([held_by, owner[tree.query(samples)[1]]])
 
 
-class _Attachment:
-    """Which bone holds each centre and each sample, as a position in ``bones``; -1 where none
-    does.
-    """
-
-    def __init__(
-        self,
-        muscle: Muscle,
-        scene: Scene,
-        frame: RestFrame,
-        centres: np.ndarray,
-        samples: np.ndarray,
-    ) -> None:
-        names = sorted(attachment_frames(scene.bones, muscle))
-        patches = [np.asarray(attachment.vertices) for attachment in muscle.attachments]
-        numbers = np.array(
-            [names.index(attachment.attachment_frame) for attachment in muscle.attachments]
-        )
-        owner = np.full(len(frame.local), -1)
-        for number, patch in zip(numbers, patches):
-            owner[patch] = number
-        used = np.unique(owner[owner >= 0])
-        self.bones = [names[b] for b in used]
-        place = np.full(len(names) + 1, -1)
-        place[used] = np.arange(len(used))
-        owner, numbers = place[owner], place[numbers]
-        tree = cKDTree(frame.local)
-        nearest = tree.query(centres)[1]
-        self.centres, self.samples = owner[nearest], owner[tree.query(samples)[1]]
-        for number, patch in zip(numbers, patches):
-            if number >= 0 and np.isin(nearest, patch).sum() < LEAST_ATTACHED:
-                self._claim(number, cKDTree(frame.local[patch]).query(centres)[0])
-
-    def _claim(self, number: int, distance: Floats) -> None:
-        """Give a bone the centres nearest to its patch, but none that a bone next to it needs."""
-        held = np.bincount(self.centres[self.centres >= 0], minlength=len(self.bones))
-        left = LEAST_ATTACHED
-        for centre in np.argsort(distance, kind="stable"):
-            own = self.centres[centre]
-            if own >= 0 and own != number:
-                if held[own] <= LEAST_ATTACHED:
-                    continue
-                held[own] -= 1
-            self.centres[centre] = number
-            left -= 1
-            if left == 0:
-                return
+def _claim(held_by: Integers, number: int, distance: Floats) -> None:
+    """Give a bone the centres nearest to its patch, but none that a bone next to it needs."""
+    held = np.bincount(held_by[held_by >= 0])
+    left = LEAST_ATTACHED
+    for centre in np.argsort(distance, kind="stable"):
+        own = held_by[centre]
+        if own >= 0 and own != number:
+            if held[own] <= LEAST_ATTACHED:
+                continue
+            held[own] -= 1
+        held_by[centre] = number
+        left -= 1
+        if left == 0:
+            return
 
 
 def solved_points(muscle: Muscle, scene: Scene, options: RBFOptions) -> str:
     """How many centres a muscle will have, and why."""
-    chosen = choose_centres(ordered_muscle(muscle)[0], scene, options, known_only=True)
-    return f"{chosen.centres} centres ({chosen.reason})"
+    count, why = choose_centres(ordered_muscle(muscle)[0], scene, options, known_only=True)
+    return f"{count} centres ({why})"

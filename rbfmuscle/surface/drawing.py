@@ -33,18 +33,27 @@ MARCHING_CELLS = 48
 STRETCHED = 1.6
 
 
-class RestSurface(NamedTuple):
-    """What a surface is drawn from at rest: K centres with a field through them, S samples."""
+class RestState(NamedTuple):
+    """An RBF muscle at rest: K centres, whose field is its surface, and S samples of the
+    surface.
+    """
 
-    fit: FieldFit
-    parts: Integers  # (P, n) centres of each local fit
     centres: Floats  # (K, 3)
     normals: Floats  # (K, 3)
-    points: Floats  # (K + S, 3) centres, then samples
-    held_by: Integers  # (K + S,) place in ``bones`` of what holds them, -1 where free
+    samples: Floats  # (S, 3)
+    sample_faces: Integers  # (m, 3) closed outward triangulation of the samples
+    fit: FieldFit  # how the field through the centres is fitted
+    parts: Integers  # (P, n) centres of its local fits
+    # bones, and ends of tendons, that hold the muscle, by their names; the axes turn with the first
+    bones: list[str]
+    # (K + S,) position in ``bones`` of what holds a contact point, -1 where free
+    attached_bone: Integers
     volume: float  # of the muscle's mesh [scene unit cubed]
     axes: Floats  # (3, 3) principal axes as rows
-    bones: list[str]  # that hold the muscle; the axes turn with the first
+
+    def contact_points(self) -> Floats:
+        """Centres, then samples, (K + S, 3)."""
+        return np.concatenate([self.centres, self.samples])
 
 
 class SurfaceBuilder:
@@ -60,7 +69,7 @@ class SurfaceBuilder:
         self,
         muscle: Muscle,
         scene: Scene,
-        rest: RestSurface,
+        rest: RestState,
         embed: Callable[[Floats], Carry],
         *,
         shape: str,
@@ -188,8 +197,8 @@ class SurfaceBuilder:
         if self._bones is None or self._bones[0] is not contacts:
             at_rest = np.tile(np.eye(4), (len(contacts.placed), 1, 1))
             resting = ShownBones(self.shown, contacts.bones, at_rest, self._grids)
-            nearest = cKDTree(self.rest.points).query(self.shown.rest)[1]
-            kept = (self.rest.held_by >= 0) | (contacts.allowed > 0.0).any(axis=0)
+            nearest = cKDTree(self.rest.contact_points()).query(self.shown.rest)[1]
+            kept = (self.rest.attached_bone >= 0) | (contacts.allowed > 0.0).any(axis=0)
             cleared = clear_rest(self.shown, resting, kept[nearest])
             if not np.array_equal(cleared, self.shown.rest):
                 self._take(cleared, self.shown.faces)
@@ -235,10 +244,10 @@ class SurfaceBuilder:
         """
         lengths, found = _lengths(carried, self.shown.faces), ""
         depth = float(lengths.mean())
-        held_by = self.rest.held_by[: len(centres)]
+        attached_bone = self.rest.attached_bone[: len(centres)]
         for b, name in enumerate(contacts.bones.names):
             own = self.rest.bones.index(name) if name in self.rest.bones else -1
-            held = (held_by >= 0) & (held_by != own)
+            held = (attached_bone >= 0) & (attached_bone != own)
             deepest = -contacts.distance_and_direction(centres[held], b)[0].min(initial=0.0)
             if deepest > depth:
                 depth, found = deepest, name

@@ -12,7 +12,7 @@ from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.field import FieldFit
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
-from rbfmuscle.surface.drawing import RestSurface, SurfaceBuilder
+from rbfmuscle.surface.drawing import RestState, SurfaceBuilder
 
 BALL = trimesh.creation.icosphere(2)
 X = np.array(BALL.vertices)
@@ -27,17 +27,17 @@ class Drawn:
 
     def __init__(self, shape="material", top=TOP, resolution=0):
         slab = trimesh.creation.box([20.0, 20.0, 4.0]).apply_translation([0.0, 0.0, top - 2.0])
-        fit = FieldFit(get_kernel("cubic"), 1.0)
-        rest = RestSurface(
-            fit,
-            np.arange(len(CENTRES))[None],
-            CENTRES,
-            CENTRES,
-            CENTRES,
-            np.where(HELD, 0, -1),
-            mesh_volume(X, np.asarray(BALL.faces)),
-            Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix(),  # the ball itself has no axes
-            ["holding"],
+        rest = RestState(
+            centres=CENTRES,
+            normals=CENTRES,
+            samples=np.zeros((0, 3)),
+            sample_faces=np.zeros((0, 3), dtype=int),
+            fit=FieldFit(get_kernel("cubic"), 1.0),
+            parts=np.arange(len(CENTRES))[None],
+            bones=["holding"],
+            attached_bone=np.where(HELD, 0, -1),
+            volume=mesh_volume(X, np.asarray(BALL.faces)),
+            axes=Rotation.from_rotvec([0.2, 0.5, -0.3]).as_matrix(),  # the ball itself has no axes
         )
         self.builder = SurfaceBuilder(
             SimpleNamespace(name="ball", source=None, mesh=BALL),
@@ -48,7 +48,7 @@ class Drawn:
             resolution=resolution,
         )
         bones = BonesInReach(["slab"], [BoneSDF.from_mesh(slab)])
-        self.contacts = BoneContacts(bones, rest.held_by)
+        self.contacts = BoneContacts(bones, rest.attached_bone)
 
     def __call__(self, linear, *, raised=0.0, fitted=True, turned=None):
         turned = np.eye(4) if turned is None else turned
