@@ -24,7 +24,7 @@ from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
-from rbfmuscle.simulation.frame import LogState, ModelSurface, SolveLog
+from rbfmuscle.simulation.frame import ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
 from rbfmuscle.simulation.touching import Body, surface_points
 
@@ -52,7 +52,7 @@ class PBDState(NamedTuple):
     shape: np.ndarray | None
     time: float
     penetration: float
-    log: LogState
+    log: SolveLog
     activation: float
 
 
@@ -91,7 +91,7 @@ class PBDMuscle:
             self.most_sweeps = self.options.iterations or MOST_SWEEPS
         self.size = diameter(self.rest.vertices)
         self.still = method.tolerance * self.size
-        self.log = SolveLog(solver_residual=0.0)
+        self.log = SolveLog({"solver_residual": 0.0})
         self._contacts: BoneContacts
         self._surface: MovingSurface | None = None
         frames = attachment_frames(scene.bones, muscle)
@@ -168,7 +168,7 @@ class PBDMuscle:
         self.penetration = self.contact.depth(self.points)
         unsettled = self.still > 0.0 and not moving.moved < self.still
         capped = int(unsettled) + int(self.penetration > self.depth)
-        self.log.add(caps=capped, solver_residual=moving.moved / self.size)
+        self.log = self.log.add(caps=capped, solver_residual=moving.moved / self.size)
 
     def body(self) -> Body:
         """What others meet that touch this muscle."""
@@ -197,7 +197,7 @@ class PBDMuscle:
             self.shape.snapshot(),
             self.time,
             self.penetration,
-            self.log.state,
+            self.log,
             0.0 if self.fibres is None else self.fibres.activation,
         )
 
@@ -207,7 +207,7 @@ class PBDMuscle:
         self.shape.restore(state.shape)
         self.time = state.time
         self.penetration = state.penetration
-        self.log.state = state.log
+        self.log = state.log
         self.activate(state.activation)
 
     def material_mesh(self) -> tuple[np.ndarray, np.ndarray]:
@@ -223,7 +223,7 @@ class PBDMuscle:
 
     def surface(self, contacts: BoneContacts) -> ModelSurface:
         """The mesh as it is now, where it overlapped bones at rest taken out of them."""
-        quantities, notes = self.log.take()
+        quantities, notes, self.log = self.log.take()
         quantities |= {
             "solver_penetration_max": self.penetration,
             "solver_sweeps": float(self.swept),

@@ -23,7 +23,7 @@ from rbfmuscle.scene.muscles import attachment_frames, ordered_muscle
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import EVERYWHERE, BoneContacts
-from rbfmuscle.simulation.frame import LogState, Mesh, ModelSurface, SolveLog
+from rbfmuscle.simulation.frame import Mesh, ModelSurface, SolveLog
 from rbfmuscle.simulation.neighbours import SEARCHED
 from rbfmuscle.simulation.touching import Body, surface_points
 from rbfmuscle.solid.contact import Obstacles
@@ -123,7 +123,7 @@ class RBFMuscle:
         self.attached_bone = np.where(owner < 0, -1, numbers[owner])
         self._met: tuple[BoneContacts, Obstacles] | None = None
         self._material: Material | None = None
-        self.log = SolveLog(solver_residual=0.0, solid_volume_error=0.0)
+        self.log = SolveLog({"solver_residual": 0.0, "solid_volume_error": 0.0})
 
     def contact_points(self) -> np.ndarray:
         """Centres, then surface samples, (K + S, 3); never changed in place."""
@@ -162,7 +162,7 @@ class RBFMuscle:
         """Take the state where a solve ended."""
         self.state = solid.finish()
         report = solid.report()
-        self.log.add(
+        self.log = self.log.add(
             caps=len(report.caps),
             solver_residual=report.error,
             solid_volume_error=report.volume_error,
@@ -225,13 +225,13 @@ class RBFMuscle:
         """Go along with a rigid motion (4, 4), as the muscle is."""
         self.state = transform(self.state, motion)
 
-    def snapshot(self) -> tuple[SolidState, float, float, LogState]:
+    def snapshot(self) -> tuple[SolidState, float, float, SolveLog]:
         """Everything that :meth:`restore` needs."""
-        return self.state, self._asked, self.drawer.level, self.log.state
+        return self.state, self._asked, self.drawer.level, self.log
 
-    def restore(self, state: tuple[SolidState, float, float, LogState]) -> None:
+    def restore(self, state: tuple[SolidState, float, float, SolveLog]) -> None:
         """Go back to a snapshot."""
-        solid, self._asked, self.drawer.level, self.log.state = state
+        solid, self._asked, self.drawer.level, self.log = state
         self._take_activation(solid.activation)
         self.state = solid
 
@@ -251,7 +251,7 @@ class RBFMuscle:
         columns = self.model.embedding.columns
         turned_normals(nodes, columns, self._normals_at, self.rest.normals, normals)
         drawn = self.drawer.draw(self.state.points, nodes, normals, contacts)
-        quantities, notes = self.log.take()
+        quantities, notes, self.log = self.log.take()
         # Before what the solve left in a bone was lifted out of it.
         settled = self.model.embedding.of(self.state.nodes)
         drawn.quantities["solver_penetration_max"] = contacts.depth(settled)

@@ -84,14 +84,3 @@ def build_fields(scene: Scene, regions: Regions) -> dict[str, BoneSDF]:
     bones = [bone for bone in scene.bones if bone.name in reached]
     fields = each(lambda bone: BoneSDF.from_mesh(bone.mesh, name=bone.name), bones)
     return {bone.name: field for bone, field in zip(bones, fields)}
-
-
-def bone_regions(regions: Regions) -> dict[str, Floats]:
-    """Least box (2, 3) of each bone that holds what all muscles can reach of it."""
-    boxes: dict[str, list[Floats]] = {}
-    for (_, bone), box in regions.items():
-        boxes.setdefault(bone, []).append(box)
-    return {
-        bone: np.array([np.min(found, axis=0)[0], np.max(found, axis=0)[1]])
-        for bone, found in boxes.items()
-    }

@@ -108,39 +108,28 @@ class Frame:
     fibres: Mapping[str, FibreLines] = field(default_factory=dict, repr=False)
 
 
-class LogState(NamedTuple):
-    """What a `SolveLog` holds: the greatest of each quantity, how often a solve ended at a cap, and
-    whether these were taken.
-    """
-
-    worst: Mapping[str, float]
-    capped: int
-    taken: bool
-
-
-class SolveLog:
+class SolveLog(NamedTuple):
     """How the solves of a model ended since its last drawing, for the quantities and notes of its
-    surface; ``at_rest`` are the quantities before any solve. Its ``state`` is never changed in
-    place: it is its own snapshot.
+    surface; before any solve, the quantities at rest. It is never changed in place.
     """
 
-    def __init__(self, **at_rest: float) -> None:
-        self.state = LogState(at_rest, 0, False)
+    worst: Mapping[str, float]  # the greatest of each quantity
+    capped: int = 0  # how often a solve ended at a cap
+    taken: bool = False  # whether these were taken
 
-    def add(self, *, caps: int, **quantities: float) -> None:
-        """Count a solve: how often it ended at a cap, and its ``solver_residual`` and others, of
-        which the greatest are kept.
+    def add(self, *, caps: int, **quantities: float) -> "SolveLog":
+        """With another solve: how often it ended at a cap, and its ``solver_residual`` and others,
+        of which the greatest are kept.
         """
-        worst = {} if self.state.taken else dict(self.state.worst)
+        worst = {} if self.taken else dict(self.worst)
         for name, value in quantities.items():
             worst[name] = float(np.fmax(value, worst.get(name, 0.0)))
-        self.state = LogState(worst, self.state.capped + caps, False)
+        return SolveLog(worst, self.capped + caps)
 
-    def take(self) -> tuple[dict[str, float], list[tuple[str, int, str]]]:
-        """Quantities and notes for a `ModelSurface`."""
-        worst, capped, _ = self.state
-        self.state = LogState(worst, 0, True)
-        return dict(worst), [("", capped, "iteration_cap")] if capped else []
+    def take(self) -> "tuple[dict[str, float], list[tuple[str, int, str]], SolveLog]":
+        """Quantities and notes for a `ModelSurface`, and the log from then on."""
+        notes = [("", self.capped, "iteration_cap")] if self.capped else []
+        return dict(self.worst), notes, SolveLog(self.worst, taken=True)
 
 
 class MuscleModel(Protocol):

@@ -281,15 +281,13 @@ def _group(steppers: list[MuscleStepper], members: list[int], links: list[Link])
 
 def _obstacles(scene, models, bone_sdfs):
     """One BoneContacts for each model, with fields of the bones that it can reach."""
-    regions = find_contact_pairs(scene) if bone_sdfs is None else None
-    here = {model.name for model in models}
-    if regions is not None:
-        met = {bone for muscle, bone in regions if muscle in here}
-        bone_sdfs = build_fields(
-            scene, {pair: box for pair, box in regions.items() if pair[1] in met}
-        )
-    names = [bone.name for bone in scene.bones]
-    order = [name for name in names if name in bone_sdfs]
+    regions = None
+    if bone_sdfs is None:
+        here = {model.name for model in models}
+        found = find_contact_pairs(scene)
+        regions = {pair: box for pair, box in found.items() if pair[0] in here}
+        bone_sdfs = build_fields(scene, regions)
+    order = [bone.name for bone in scene.bones if bone.name in bone_sdfs]
     for model in models:
         met = [name for name in order if regions is None or (model.name, name) in regions]
         parts = None if regions is None else [regions[model.name, name] for name in met]

@@ -19,7 +19,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact_pairs import sampled_poses, swept_boxes
 from rbfmuscle.simulation.held_bone import NO_POINTS, HeldBone
 from rbfmuscle.simulation.stepper import MuscleStepper
-from rbfmuscle.simulation.touching import Body, Meeting, Moving, even_points
+from rbfmuscle.simulation.touching import Body, Meeting, Moving, surface_points
 
 Link = tuple[int, int]
 
@@ -92,7 +92,10 @@ class Neighbours:
             self.held[m, number] = bone.ask(points[m], self.bodies[number].places)[0]
         for (m, _), gap in self.held.items():
             near = np.flatnonzero(gap < touched)
-            some = near[even_points(points[m][near], HOLDING * sizes[m])]
+            here = points[m][near]
+            # However high the surface rises between them.
+            even = surface_points(here, np.zeros_like(here), HOLDING * sizes[m], np.inf)
+            some = near[even]
             gap[np.setdiff1d(np.arange(len(gap)), some)] = np.nan
 
     def find(self, solids: Sequence[Moving]) -> Meeting | None:

@@ -5,7 +5,7 @@ import numpy as np
 from rbfmuscle.scene.motion import completed, rest_coordinates
 from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.contact_pairs import bone_regions, find_contact_pairs
+from rbfmuscle.simulation.contact_pairs import find_contact_pairs
 from rbfmuscle.simulation.neighbours import connected, find_links
 from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
@@ -40,8 +40,11 @@ def plan_scene(scene: Scene) -> dict[str, object]:
                 "substeps": counts[-1],
             }
         )
-    for name, box in bone_regions(regions).items():
+    for name in dict.fromkeys(bone for _, bone in regions):
         mesh = scene.bone(name).mesh
+        boxes = np.array([found for (_, bone), found in regions.items() if bone == name])
+        # The least that holds what all muscles can reach of it.
+        box = np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
         own = np.asarray(mesh.bounds, dtype=float)
         reached, extent = np.diff(np.clip(box, own[0], own[1]), axis=0)[0], own[1] - own[0]
         wide = extent > 0.0  # a bone may be flat

@@ -277,18 +277,6 @@ class Meeting:
         return np.where(back, np.abs(motion), motion)
 
 
-class Contacts(NamedTuple):
-    """Contacts of one body with obstacles."""
-
-    wanted: Wanted
-    own: Embedding
-
-    def lacking(self, motion: Floats) -> Floats:
-        """Motion (c,) that contacts still want after a motion (N, 3) of the body."""
-        moved = self.own.of(motion)
-        return np.asarray(self.wanted.motion - np.einsum("ca,ca->c", self.wanted.normal, moved))
-
-
 def settle(solids: Sequence[Moving], meeting: Meeting | None = None) -> None:
     """Iterate bodies that may touch each other until each has ended.
 
@@ -318,10 +306,10 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
     """
     size = min(solid.size for solid in solids)
     bodies = np.flatnonzero(acting).tolist()
-    asked, chosen = {}, {}
+    asked, own, chosen = {}, {}, {}
     for m in bodies:
-        wanted = solids[m].meet()
-        asked[m] = Contacts(wanted, solids[m].feet_of(wanted.point))
+        wanted = asked[m] = solids[m].meet()
+        own[m] = solids[m].feet_of(wanted.point)
         chosen[m] = deepest(wanted.motion, wanted.force, PRECISE * size, BATCH)
     touching = np.zeros(0, dtype=np.int64)
     batch = BATCH * len(bodies)
@@ -333,12 +321,14 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
     stale = set(bodies)
     for _ in range(ROUNDS):
         for m in stale:
-            rows[m] = _rows_of(m, solids[m], asked[m].wanted, chosen[m], meeting, touching)
+            rows[m] = _rows_of(m, solids[m], asked[m], chosen[m], meeting, touching)
         shares, found = find_forces(asked, chosen, meeting, touching, rows, PRECISE * size)
         motions = {m: rows[m].motion(part) for m, part in shares.items() if len(part)}
         stale = set()
         for m in bodies:
-            lacks = asked[m].lacking(motions[m]) if m in motions else asked[m].wanted.motion
+            lacks = asked[m].motion
+            if m in motions:
+                lacks = lacks - np.einsum("ca,ca->c", asked[m].normal, own[m].of(motions[m]))
             more = _more(lacks, chosen[m], LEFT * size, BATCH)
             if len(more):
                 chosen[m] = np.union1d(chosen[m], more)
@@ -353,7 +343,7 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
             break
     for m in bodies:
         solids[m].forces_capped = not found or m in stale
-        solids[m].push(motions.get(m), rows[m], shares[m], asked[m].wanted)
+        solids[m].push(motions.get(m), rows[m], shares[m], asked[m])
 
 
 def deepest(wants: Floats, force: Floats, least: float, batch: int) -> Integers:
@@ -398,7 +388,7 @@ def _rows_of(
 
 
 def find_forces(
-    asked: Mapping[int, Contacts],
+    asked: Mapping[int, Wanted],
     chosen: Mapping[int, Integers],
     meeting: Meeting | None,
     touching: Integers,
@@ -414,7 +404,7 @@ def find_forces(
     row = np.concatenate([np.arange(count) for count in counts])
     across, least = other, np.zeros(len(one))
     motion, yields, most, force = (
-        np.concatenate([getattr(part.wanted, name)[chosen[m]] for m, part in asked.items()])
+        np.concatenate([getattr(part, name)[chosen[m]] for m, part in asked.items()])
         for name in ("motion", "yields", "most", "force")
     )
     if meeting is not None:
@@ -456,9 +446,9 @@ def find_forces(
     )
     shares = {m: np.zeros(count) for m, count in zip(asked, width, strict=True)}
     parts = np.split(force[: counts.sum()], np.cumsum(counts)[:-1])
-    for (m, contacts), part in zip(asked.items(), parts, strict=True):
-        contacts.wanted.force[:] = 0.0
-        contacts.wanted.force[chosen[m]] = shares[m][: len(part)] = part
+    for (m, wanted), part in zip(asked.items(), parts, strict=True):
+        wanted.force[:] = 0.0
+        wanted.force[chosen[m]] = shares[m][: len(part)] = part
     if meeting is not None:
         meeting.force[np.isfinite(meeting.wants)] = 0.0
         meeting.force[touching] = between = force[counts.sum() :]
@@ -475,13 +465,6 @@ def _rank(of: Integers, count: int) -> Integers:
         same = of == value
         rank[same] = np.arange(np.count_nonzero(same))
     return rank
-
-
-def even_points(points: Floats, spacing: float) -> Integers:
-    """Which of the points (n, 3) to take, in order, so that none is nearer to another than the
-    ``spacing``.
-    """
-    return surface_points(points, np.zeros_like(points), spacing, np.inf)
 
 
 def surface_points(points: Floats, normals: Floats, spacing: float, height: float) -> Integers:

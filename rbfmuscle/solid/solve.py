@@ -24,7 +24,6 @@ from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import (
     TOLERANCE,
-    Contacts,
     Wanted,
     find_forces,
 )
@@ -495,9 +494,8 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
         wanted = Wanted(point, touch.source, touch.normal, -touch.gap, zero, zero + np.inf, zero)
         rows = solid.rows_of(point, touch.normal)
         every = np.arange(len(point))
-        met = Contacts(wanted, solid.feet_of(point))
         force, _ = find_forces(
-            {0: met}, {0: every}, None, every[:0], {0: rows}, 0.1 * TOLERANCE * size
+            {0: wanted}, {0: every}, None, every[:0], {0: rows}, 0.1 * TOLERANCE * size
         )
         y = y + rows.motion(force[0])
         # A push keeps the volumes to first order.

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.interpolation import Embedding, carry
-from rbfmuscle.simulation.touching import Contacts, Wanted, find_forces, solve_forces
+from rbfmuscle.simulation.touching import Wanted, find_forces, solve_forces
 from rbfmuscle.solid.contact import Obstacles, Reaction, fill_delassus
 from rbfmuscle.solid.kernels import (
     ACTIVE,
@@ -77,9 +77,8 @@ def forces_of(delassus, wants, most=np.inf, yields=0.0, tolerance=1e-13):
         np.full(count, most),
         np.zeros(count),
     )
-    contacts = Contacts(wanted, Embedding(np.zeros((count, 1), dtype=int), np.ones((count, 1))))
     rows = SimpleNamespace(delassus=delassus)
-    force, found = find_forces({0: contacts}, {0: every}, None, every[:0], {0: rows}, tolerance)
+    force, found = find_forces({0: wanted}, {0: every}, None, every[:0], {0: rows}, tolerance)
     return force[0], found
 
 
