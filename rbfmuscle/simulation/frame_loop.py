@@ -16,7 +16,6 @@ from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
 from rbfmuscle.simulation.group import Group, GroupState
 from rbfmuscle.simulation.neighbours import Link, connected, find_links
-from rbfmuscle.simulation.rigid_transport import RigidTransport
 from rbfmuscle.simulation.stepper import MuscleStepper, keep_initial_overlap
 from rbfmuscle.simulation.substeps import PoseCache
 
@@ -83,10 +82,6 @@ class FrameLoop:
         names = [stepper.name for stepper in self.steppers]
         links = find_links(scene, names)
         joined = connected(len(names), links)
-        for first, *others in joined:
-            stepper = self.steppers[first]
-            if not others and not stepper.contracts:
-                stepper.rigid_transport = RigidTransport(scene.muscle(stepper.name), scene)
         self._next_index = 0
         self._wall = 0.0
         with self.working():

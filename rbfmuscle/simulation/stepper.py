@@ -53,7 +53,7 @@ class StepperState(NamedTuple):
 
     model: object
     poses: Mapping[str, Floats]
-    rigid_transport: RigidState | None
+    rigid_transport: RigidState
     shown: ModelSurface | None
     events: dict[tuple[int, str, str], int]
     frame: int
@@ -65,9 +65,9 @@ class MuscleStepper:
     """One model among obstacles of its own, which a `Group` takes through sub-steps.
 
     ``substeps`` gives sub-steps by the relative motion of the bones that the muscle meets;
-    ``rigid_transport`` moves the muscle rigidly where it need not be solved, None where it is
-    always solved. ``times`` has the time spent on each stage since the last `collect` [s], ``cost``
-    what was spent before that on sub-steps and on surfaces [s].
+    ``rigid_transport`` moves the muscle rigidly where it need not be solved. ``times`` has the time
+    spent on each stage since the last `collect` [s], ``cost`` what was spent before that on
+    sub-steps and on surfaces [s].
     """
 
     def __init__(
@@ -83,16 +83,14 @@ class MuscleStepper:
         self.scene = scene
         self.name = model.name
         self.poses = poses or PoseCache(scene)
-        self.detect = scene.detect.tunnelling
-        self.tolerance = from_mm(TOUCH, scene.units)
         self.times: dict[str, float] = defaultdict(float)
         self.cost = (0.0, 0.0)
         self.events: dict[tuple[int, str, str], int] = {}
         self.frame, self.solves = 0, 0
-        self.contracts = scene.muscle(self.name).contraction is not None
-        met = contacts.bones.names
-        self.substeps = SubSteps(scene, scene.muscle(self.name), bones=met, poses=self.poses)
-        self.rigid_transport: RigidTransport | None = None
+        muscle, met = scene.muscle(self.name), contacts.bones.names
+        self.contracts = muscle.contraction is not None
+        self.substeps = SubSteps(scene, muscle, bones=met, poses=self.poses)
+        self.rigid_transport = RigidTransport(muscle, scene)
         # The surface since the last solve, where later ones are that one moved rigidly.
         self._shown: ModelSurface | None = None
         # Whether points crossed a bone in this frame or the last that no step resolved: halving is
@@ -123,8 +121,8 @@ class MuscleStepper:
             self.model.contact_points(),
             path.old,
             path.new,
-            self.detect,
-            tolerance=self.tolerance,
+            self.scene.detect.tunnelling,
+            tolerance=from_mm(TOUCH, self.scene.units),
         )
         self.times["time_tunnelling"] += perf_counter() - started
         crossings = []
@@ -142,13 +140,10 @@ class MuscleStepper:
         started, rigid_transport = perf_counter(), self.rigid_transport
         shown = self._shown
         if shown is not None:
-            drawn = shown.moved(
-                IDENTITY if rigid_transport is None else rigid_transport.state.since
-            )
+            drawn = shown.moved(rigid_transport.state.since)
         else:
             drawn = self._shown = self.model.surface(self.contacts)
-            if rigid_transport is not None:
-                rigid_transport.state = rigid_transport.state._replace(since=IDENTITY)
+            rigid_transport.state = rigid_transport.state._replace(since=IDENTITY)
         self.times["time_surface"] += perf_counter() - started
         return drawn
 
@@ -183,7 +178,7 @@ class MuscleStepper:
         events = [
             Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
         ]
-        moved = self.rigid_transport is not None and self.rigid_transport.collect()
+        moved = self.rigid_transport.collect()
         self.times.clear()
         self.events = {}
         self.solves = 0
@@ -195,11 +190,10 @@ class MuscleStepper:
 
     def snapshot(self) -> StepperState:
         """The state, for :meth:`restore`; times are none of it."""
-        rigid_transport = self.rigid_transport
         return StepperState(
             self.model.snapshot(),
             self.contacts.poses,
-            None if rigid_transport is None else rigid_transport.state,
+            self.rigid_transport.state,
             self._shown,
             dict(self.events),
             self.frame,
@@ -211,8 +205,7 @@ class MuscleStepper:
         """Return to a snapshot, which stays valid."""
         self.model.restore(state.model)
         self.contacts.move(state.poses)
-        if self.rigid_transport is not None and state.rigid_transport is not None:
-            self.rigid_transport.state = state.rigid_transport
+        self.rigid_transport.state = state.rigid_transport
         self._shown = state.shown
         self.events = dict(state.events)
         self.frame = state.frame
