@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
+from rbfmuscle.geometry.arrays import to_world
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.touching import Body, Moving
 
@@ -53,7 +54,7 @@ class ModelSurface:
 
     def moved(self, motion: np.ndarray) -> "ModelSurface":
         """The surface after a rigid motion (4, 4), which took no time."""
-        vertices = self.vertices @ motion[:3, :3].T + motion[:3, 3]
+        vertices = to_world(self.vertices, motion)
         quantities = {
             name: 0.0 if name.startswith("time_") else value
             for name, value in self.quantities.items()

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, to_world
 from rbfmuscle.geometry.frames import moved_box
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.check import Finding
@@ -52,10 +52,8 @@ def check_motion(scene: Scene) -> list[Fault]:
         extent = float(np.linalg.norm(np.ptp(np.asarray(muscle.mesh.vertices), axis=0)))
         for bones, values, bad in _followed(scene, muscle, extent, poses):
             if bad.any():
-                worst, first = (
-                    int(np.abs(values[1:] - values[0]).argmax()),
-                    int(np.flatnonzero(bad)[0]),
-                )
+                worst = int(np.abs(values[1:] - values[0]).argmax())
+                first = int(np.flatnonzero(bad)[0])
                 faults.append(
                     Fault(
                         muscle.name,
@@ -115,7 +113,7 @@ def _depth(points: Floats, bounds: Floats, place: Floats, bone: Bone) -> float:
     low, high = moved_box(bounds, place)
     if np.any(low > bone.bounds[1]) or np.any(high < bone.bounds[0]):
         return 0.0
-    return max(0.0, -float(bone.distances(points @ place[:3, :3].T + place[:3, 3]).min()))
+    return max(0.0, -float(bone.distances(to_world(points, place)).min()))
 
 
 def motion_findings(scene: Scene) -> list[Finding]:
@@ -138,10 +136,8 @@ def motion_findings(scene: Scene) -> list[Finding]:
                 "the motion sooner"
             )
         else:
-            how, ratio = (
-                "take apart" if one.value > one.rest else "bring together",
-                one.value / one.rest,
-            )
+            how = "take apart" if one.value > one.rest else "bring together"
+            ratio = one.value / one.rest
             text = (
                 f"{bone!r} and {other!r} {how} its ends to {ratio:.2f} times their distance at "
                 f"rest ({one.rest:.4g} to "

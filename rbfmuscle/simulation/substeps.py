@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, to_world
 from rbfmuscle.geometry.frames import RestFrame, diameter
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.frames import interpolate
@@ -197,7 +197,7 @@ class SubSteps:
         for owner, corners in zip(limits.owner, limits.corners):
             for seen in range(limits.seen):
                 ways = [
-                    corners @ to[:3, :3].T + to[:3, 3]
+                    to_world(corners, to)
                     for to in (np.linalg.inv(pose[seen]) @ pose[owner] for pose in (old, new))
                 ]
                 far = float(np.linalg.norm(ways[1] - ways[0], axis=1).max())

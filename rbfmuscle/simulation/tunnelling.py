@@ -17,7 +17,7 @@ import numpy as np
 
 from rbfmuscle.bones.distance import distance_at
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.arrays import Floats, Integers, to_local
+from rbfmuscle.geometry.arrays import Floats, Integers, to_local, to_world
 from rbfmuscle.geometry.exact_distance import (
     BX,
     CX,
@@ -141,8 +141,8 @@ def one_sided_planes(
     name, field = bones.names[crossing.bone], bones.fields[crossing.bone]
     motion, points = after[name] @ np.linalg.inv(before[name]), start[crossing.index]
     distance, way = field.distance_and_gradient(to_local(points, before[name]))
-    moved = points @ motion[:3, :3].T + motion[:3, 3]
-    return Fences(crossing.index, distance, way @ after[name][:3, :3].T, moved)
+    normal = way @ after[name][:3, :3].T
+    return Fences(crossing.index, distance, normal, to_world(points, motion))
 
 
 @loop
