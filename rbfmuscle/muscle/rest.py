@@ -112,16 +112,6 @@ SEARCH = 4
 SEED = 0
 
 
-def wanted_error(muscle: Muscle, scene: Scene, options: RBFOptions) -> float:
-    """What a muscle's surface at rest may err by, RMS [scene unit]: as asked for, or by its
-    size.
-    """
-    if options.rest_error:
-        return options.rest_error
-    thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
-    return min(from_mm(REST_ERROR, scene.units), REST_SHARE * thickness)
-
-
 def choose_centres(
     muscle: Muscle, scene: Scene, options: RBFOptions, *, known_only: bool = False
 ) -> tuple[int, str]:
@@ -135,7 +125,10 @@ def choose_centres(
         return options.centres, "as given"
     area_for_each = AREA_FOR_EACH * from_mm(1.0, scene.units) ** 2
     usual = max(LEAST_CENTRES, int(round(muscle.mesh.area / area_for_each, -1)))
-    wanted = wanted_error(muscle, scene, options)
+    # What the surface at rest may err by, RMS [scene unit]: as asked for, or by the muscle's size.
+    thickness = 2.0 * float(muscle.mesh.volume) / float(muscle.mesh.area)
+    by_size = min(from_mm(REST_ERROR, scene.units), REST_SHARE * thickness)
+    wanted = options.rest_error or by_size
     frame = RestFrame(np.asarray(muscle.mesh.vertices, dtype=float))
     fit = (
         get_kernel(options.kernel).identity,
@@ -200,16 +193,16 @@ def place_points(
     faces = np.asarray(muscle.mesh.faces)
     centres = cached_sample(frame.local, faces, count, "greedy")
     samples = cached_sample(frame.local, faces, options.samples, "even")
-    surface = frame, faces
-    fit = _choose_fit(muscle.name, surface, options, centres, samples)
+    fit = _choose_fit(muscle.name, frame, faces, options, centres, samples)
     if options.condition or (fit.kernel.has_epsilon and not options.epsilon):
-        _refuse_broken(muscle.name, surface, fit, centres)
+        _refuse_broken(muscle.name, frame, faces, fit, centres)
     return centres, samples, fit
 
 
 def _choose_fit(
     name: str,
-    mesh: tuple[RestFrame, Integers],
+    frame: RestFrame,
+    faces: Integers,
     options: RBFOptions,
     centres: SurfaceSample,
     samples: SurfaceSample,
@@ -217,7 +210,6 @@ def _choose_fit(
     """The kernel, and its shape parameter where the scene leaves it open: by the error at the
     samples at rest.
     """
-    frame, faces = mesh
     kernel = get_kernel(options.kernel)
     fit = FieldFit(
         kernel,
@@ -249,10 +241,9 @@ def _choose_fit(
 
 
 def _refuse_broken(
-    name: str, mesh: tuple[RestFrame, Integers], fit: FieldFit, centres: SurfaceSample
+    name: str, frame: RestFrame, faces: Integers, fit: FieldFit, centres: SurfaceSample
 ) -> None:
     """Raise where the level zero at rest is open, in more sheets than one, or of another volume."""
-    frame, faces = mesh
     local = replace(fit, epsilon=fit.epsilon * frame.size)
     shape = f" and epsilon {fit.epsilon:.3g}" if fit.kernel.has_epsilon else ""
     said = f"muscle {name!r}: kernel {fit.kernel.name!r} with {len(centres.points)} centres{shape}"
