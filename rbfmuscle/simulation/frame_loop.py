@@ -132,8 +132,7 @@ class FrameLoop:
             If a muscle cannot be solved, naming muscle, frame and coordinates.
         """
         with self.working():
-            paths = self._path_to(coordinates)
-            drawn = self._solve_and_draw(paths) if self.surfaces else self._solve(paths)
+            drawn = self._solve(self._path_to(coordinates), draw=self.surfaces)
             frame = self._frame(drawn)
         frame.wall, self._wall = self._wall, 0.0
         return frame
@@ -143,7 +142,7 @@ class FrameLoop:
         returned.
         """
         with self.working():
-            self._solve(self._path_to(coordinates))
+            self._solve(self._path_to(coordinates), draw=False)
 
     @contextmanager
     def working(self) -> Iterator[None]:
@@ -181,17 +180,14 @@ class FrameLoop:
         self._next_index += 1
         return paths
 
-    def _solve(self, paths: list[Path]) -> list[ModelSurface]:
-        """Advance all groups through their sub-steps; no surfaces."""
-        each(lambda row: row[0].advance(*row[1]), list(zip(self.groups, paths)))
-        return []
-
-    def _solve_and_draw(self, paths: list[Path]) -> list[ModelSurface]:
-        """The same, and draw each muscle as soon as its group is done."""
+    def _solve(self, paths: list[Path], *, draw: bool) -> list[ModelSurface]:
+        """Advance all groups through their sub-steps, and ``draw`` each muscle as soon as its group
+        is done; no surfaces otherwise.
+        """
         drawn = in_stages(
             lambda number: self.groups[number].advance(*paths[number]),
             MuscleStepper.surface,
-            [group.steppers for group in self.groups],
+            [group.steppers if draw else [] for group in self.groups],
             lambda stepper: stepper.cost,
         )
         shown = {
@@ -199,7 +195,7 @@ class FrameLoop:
             for group, surfaces in zip(self.groups, drawn)
             for stepper, surface in zip(group.steppers, surfaces)
         }
-        return [shown[stepper.name] for stepper in self.steppers]
+        return [shown[stepper.name] for stepper in self.steppers if draw]
 
     def _frame(self, drawn: list[ModelSurface]) -> Frame:
         """The present frame, with its surfaces, if any were drawn."""

@@ -310,12 +310,15 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
     for m in bodies:
         wanted = asked[m] = solids[m].meet()
         own[m] = solids[m].feet_of(wanted.point)
-        chosen[m] = deepest(wanted.motion, wanted.force, PRECISE * size, BATCH)
+        bear = np.flatnonzero(wanted.force)
+        chosen[m] = np.union1d(bear, deepest(wanted.motion, bear, PRECISE * size, BATCH))
     touching = np.zeros(0, dtype=np.int64)
     batch = BATCH * len(bodies)
     if meeting is not None:
         meeting.prepare(solids, acting)
-        touching = deepest(meeting.lacking(meeting.wants), meeting.force, PRECISE * size, batch)
+        lacks = meeting.lacking(meeting.wants)
+        bear = np.flatnonzero(meeting.force)
+        touching = np.union1d(bear, deepest(lacks, bear, PRECISE * size, batch))
         touching = touching[np.isfinite(meeting.wants[touching])]
     rows: dict[int, Rows] = {}
     stale = set(bodies)
@@ -329,13 +332,13 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
             lacks = asked[m].motion
             if m in motions:
                 lacks = lacks - np.einsum("ca,ca->c", asked[m].normal, own[m].of(motions[m]))
-            more = _more(lacks, chosen[m], LEFT * size, BATCH)
+            more = deepest(lacks, chosen[m], LEFT * size, BATCH)
             if len(more):
                 chosen[m] = np.union1d(chosen[m], more)
                 stale.add(m)
         if meeting is not None:
             lacks = meeting.wants - meeting.apart([motions.get(m) for m in range(len(solids))])
-            more = _more(meeting.lacking(lacks), touching, LEFT * size, batch)
+            more = deepest(meeting.lacking(lacks), touching, LEFT * size, batch)
             if len(more):
                 touching = np.union1d(touching, more)
                 stale |= {*meeting.one[more].tolist(), *meeting.other[more].tolist()} & {*bodies}
@@ -346,22 +349,16 @@ def meet(solids: Sequence[Moving], acting: Booleans, meeting: Meeting | None = N
         solids[m].push(motions.get(m), rows[m], shares[m], asked[m])
 
 
-def deepest(wants: Floats, force: Floats, least: float, batch: int) -> Integers:
-    """Which contacts bear a force, and the ``batch`` others that want the longest way, more than
-    the ``least``; in order.
+def deepest(lacks: Floats, chosen: Integers, least: float, batch: int) -> Integers:
+    """The ``batch`` contacts, beside those chosen, that lack the most of what they want, more than
+    the ``least``.
     """
-    bears = force != 0.0
-    lacking = np.flatnonzero((wants > least) & ~bears)
+    joins = lacks > least
+    joins[chosen] = False
+    lacking = np.flatnonzero(joins)
     if len(lacking) > batch:
-        lacking = lacking[np.argsort(-wants[lacking], kind="stable")[:batch]]
-    return np.sort(np.concatenate([np.flatnonzero(bears), lacking]))
-
-
-def _more(lacks: Floats, chosen: Integers, least: float, batch: int) -> Integers:
-    """Contacts that lack more than the ``least``, beside those chosen."""
-    lacks = lacks.copy()
-    lacks[chosen] = -np.inf
-    return deepest(lacks, np.zeros(len(lacks)), least, batch)
+        lacking = lacking[np.argsort(-lacks[lacking], kind="stable")[:batch]]
+    return lacking
 
 
 def _rows_of(
