@@ -60,15 +60,12 @@ class Group:
     def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link] = ()) -> None:
         self.steppers = list(steppers)
         self.scene = self.steppers[0].scene
+        #: Whether a muscle of the group contracts.
+        self.contracts = any(stepper.contracts for stepper in self.steppers)
         self.detects = self.scene.detect.tunnelling.action
         self.neighbours = Neighbours(self.steppers, links)
         for number, stepper in enumerate(self.steppers if links else ()):
             stepper.contacts.out_of_neighbours = partial(self.neighbours.out_of_neighbours, number)
-
-    @property
-    def contracts(self) -> bool:
-        """Whether a muscle of the group contracts."""
-        return any(stepper.contracts for stepper in self.steppers)
 
     def split(self, before: Coordinates, after: Coordinates) -> list[Coordinates]:
         """Coordinates of the sub-steps to the next frame: as many as the muscle asks for that needs
@@ -84,7 +81,7 @@ class Group:
         """
         first = self.steppers[0]
         # One that slides on neighbours or contracts is always solved.
-        may_be_carried = len(self.steppers) == 1 and not first.contracts
+        may_be_carried = len(self.steppers) == 1 and not self.contracts
         for before, after, activation in itertools.zip_longest(stops[:-1], stops[1:], activations):
             for stepper in self.steppers:
                 if activation and stepper.name in activation:

@@ -67,7 +67,9 @@ class Neighbours:
         self.links = sorted({*links, *(link[::-1] for link in links)})
         self.state = NeighbourState({}, (), {})
         self.bodies: list[Body] = []
-        self._own: dict[int, Integers] = {}  # see `_nearest_points`
+        # By muscle, for each of its shown points the nearest of those that meet neighbours; they
+        # stay so, as they move together.
+        self._own: dict[int, Integers] = {}
         self.overlaps: dict[Link, Floats] = {}
         self.held: dict[Link, Floats] = {}  # gaps (k,) that points keep, NaN where they are free
         holders, self.bones = _held_bones(steppers)
@@ -176,9 +178,13 @@ class Neighbours:
         """
         out, state = np.zeros_like(points), self.state
         others = [other for one, other in state.near if one == number] if state.bodies else []
+        if others and number not in self._own:
+            solid = state.bodies[number]
+            places = solid.feet_of(self.bodies[number].points).of(solid.nodes)
+            self._own[number] = cKDTree(places).query(points)[1]
         for other in others:
             # Those that hang near a point that is near the neighbour.
-            nearest = state.near[number, other][self._nearest_points(number, points)]
+            nearest = state.near[number, other][self._own[number]]
             which = np.flatnonzero(nearest >= 0)
             if len(which) == 0:
                 continue
@@ -191,16 +197,6 @@ class Neighbours:
             away = 0.5 * (mine[nearer] - gap[nearer])
             out[which[nearer]] += away[:, None] * normal[nearer]
         return out
-
-    def _nearest_points(self, number: int, points: Floats) -> Integers:
-        """For each of the shown points (n, 3) of a muscle the nearest of those that meet
-        neighbours; they stay so, as they move together.
-        """
-        if number not in self._own:
-            solid = self.state.bodies[number]
-            here = solid.feet_of(self.bodies[number].points).of(solid.nodes)
-            self._own[number] = cKDTree(here).query(points)[1]
-        return self._own[number]
 
     def _known(
         self, known: Mapping[Link, Floats], one: int, other: int, which: Integers, empty: float

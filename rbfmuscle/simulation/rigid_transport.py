@@ -40,7 +40,7 @@ class RigidState(NamedTuple):
     # (b, 4, 4) poses of what holds the muscle when it was solved last, None where it never was
     solved: Floats | None
     since: Floats  # (4, 4) the rigid motion since its surface was drawn last
-    moved: bool  # whether it was moved since the last `collect`
+    moved: bool  # whether it was moved since the last frame
 
 
 class RigidTransport:
@@ -113,12 +113,6 @@ class RigidTransport:
         since = motion @ known.since if moves else known.since
         self.state = RigidState(old, since, moves or known.moved)
         return True
-
-    def collect(self) -> bool:
-        """Whether the muscle was moved since the last call."""
-        moved = self.state.moved
-        self.state = self.state._replace(moved=False)
-        return moved
 
     def _touches(self, model: MuscleModel, contacts: BoneContacts, bones: list[int]) -> bool:
         """Whether one of these bones in reach is near the muscle now."""

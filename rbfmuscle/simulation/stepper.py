@@ -178,7 +178,8 @@ class MuscleStepper:
         events = [
             Event(k, self.name, bone, n, action) for (k, bone, action), n in self.events.items()
         ]
-        moved = self.rigid_transport.collect()
+        moved = self.rigid_transport.state.moved
+        self.rigid_transport.state = self.rigid_transport.state._replace(moved=False)
         self.times.clear()
         self.events = {}
         self.solves = 0
