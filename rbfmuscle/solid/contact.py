@@ -16,6 +16,8 @@ from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import NO_FENCES
 from rbfmuscle.solid.kernels import add_rows
 
+# Least cosine of the angle between the normals of a bone and of its rounded surface that counts.
+LEAST_ALONG = 0.5
 MOST_ROWS = 800  # contact points whose rows are kept: more are found anew
 
 
@@ -116,12 +118,16 @@ class Obstacles:
         return _joined(parts)
 
     def meet_exactly(self, which: Integers, here: Floats, reach: float) -> Touch:
-        """The same with the bones as they are."""
+        """The same with the bones as they are, but along the normals of the rounded ones: those of
+        facets turn at once where a point passes an edge.
+        """
         parts = [self._meet_fences(which, here)]
         for b in range(len(self.exact)):
             gap, normal = self.ask(b, which, here, np.full(len(which), reach))
             near = np.flatnonzero(gap < reach)
-            parts.append(Touch(near, np.full(len(near), b), gap[near], normal[near]))
+            gap, normal = gap[near], normal[near]
+            turn_normals(self.rounded[b], self.poses[b], here[near], gap, normal)
+            parts.append(Touch(near, np.full(len(near), b), gap, normal))
         return _joined(parts)
 
     def ask(self, b: int, which: Integers, here: Floats, reach: Floats) -> tuple[Floats, Floats]:
@@ -220,6 +226,32 @@ def meet_bone(
                 normal[count, a] = pose[a, 0] * x + pose[a, 1] * y + pose[a, 2] * z
             count += 1
     return count, lost
+
+
+@loop
+def turn_normals(rounded, pose, here, gap, normal):
+    """Turn the normals (k, 3) at points ``here`` (k, 3) to those of a rounded bone with ``pose``
+    (4, 4), where it has any; the gaps (k,) become the ways along these.
+    """
+    for k in range(len(here)):
+        x = here[k, 0] - pose[0, 3]
+        y = here[k, 1] - pose[1, 3]
+        z = here[k, 2] - pose[2, 3]
+        _, _, gx, gy, gz = rounded_at(
+            rounded,
+            pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
+            pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
+            pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
+            LEAST_SLOPE,
+        )
+        if np.isnan(gx):
+            continue
+        along = 0.0
+        for a in range(3):
+            turned = pose[a, 0] * gx + pose[a, 1] * gy + pose[a, 2] * gz
+            along += turned * normal[k, a]
+            normal[k, a] = turned
+        gap[k] /= max(along, LEAST_ALONG)
 
 
 @loop(fastmath={"contract"})
