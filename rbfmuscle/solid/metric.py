@@ -102,16 +102,23 @@ class Metric(NamedTuple):
 
 
 def find_metric(
-    model: SolidModel, gradient: Floats, work: Floats, squeezed: Booleans, pressure: Floats
+    model: SolidModel,
+    gradient: Floats,
+    work: Floats,
+    squeezed: Booleans,
+    pressure: Floats,
+    *,
+    floor: float = FLOOR,
 ) -> Metric:
     """The metric for gradients (M, 3, N) of the regions' volumes and their pressures (M,), where
-    the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,).
+    the points are as in ``work`` (C, ROWS * P), some of them ``squeezed`` (Q,). ``floor`` is the
+    least stiffness of a point along any direction, over 2 μ, towards which it is raised.
 
     LinAlgError where the gradients are not independent, or H is not positive definite.
     """
     count, _, nodes = gradient.shape
     points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS))
-    inverse = _positive_inverse(model, points, squeezed)
+    inverse = _positive_inverse(model, points, squeezed, floor)
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
     answer = flat @ inverse
     compliance = answer @ flat.T
@@ -123,11 +130,13 @@ def find_metric(
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def _positive_inverse(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
+def _positive_inverse(
+    model: SolidModel, points: Floats, squeezed: Booleans, floor: float
+) -> Floats:
     """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
     which H is positive definite.
     """
-    missing = lacking(points)
+    missing = lacking(points, floor)
     for share in SHARES:
         inverse = inverted(stiffness_matrix(model, points + share * missing, squeezed))
         if inverse is not None:
@@ -135,10 +144,10 @@ def _positive_inverse(model: SolidModel, points: Floats, squeezed: Booleans) -> 
     raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
 
 
-def lacking(points: Floats) -> Floats:
-    """What the stiffness (Q, 9, 9) of points lacks of `FLOOR` along any direction."""
+def lacking(points: Floats, floor: float = FLOOR) -> Floats:
+    """What the stiffness (Q, 9, 9) of points lacks of a ``floor`` along any direction."""
     value, vector = np.linalg.eigh(points)
-    missing = np.maximum(FLOOR - value, 0.0)
+    missing = np.maximum(floor - value, 0.0)
     return np.asarray((vector * missing[:, None, :]) @ vector.swapaxes(1, 2))
 
 

@@ -47,11 +47,13 @@ TOGETHER = 4.0
 NODES_PER_REGION = 8
 # Points that move by less than this fraction of the median for a unit force count as attached.
 MOBILE = 0.02
-# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.83 of their distance at rest,
+# Tension of slack fibres over 2 μ: for a muscle whose ends are at 0.7 of their distance at rest,
 # and for shorter ones, it is 0.06 of that at full activation. It begins with no slope: a tension
 # that shortens fibres by more than the ends approach, as any above 1.5 (1 - d / d₀) does, would
-# straighten the muscle at the first motion.
-ANTI_BUCKLING_TENSION, GREATEST_TENSION = 30.0, 0.9
+# straighten the muscle at the first motion. Where it straightens the muscle within a few degrees,
+# lengths bend there: with 30 in place of 10 their second differences on the hip are a quarter
+# greater.
+ANTI_BUCKLING_TENSION, GREATEST_TENSION = 10.0, 0.9
 BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
