@@ -87,10 +87,7 @@ def _table():
             for name in (first, *more):
                 muscles[key(name)] = MuscleFacts(first, *map(_places, places))
     ends = {word for words in table["ends"].values() for word in words.split()}
-    shared = {
-        key(name): tuple(map(str.strip, found.split(",")))
-        for name, found in table["shared"].items()
-    }
+    shared = {key(name): _listed(found) for name, found in table["shared"].items()}
     known = {word for name in (*bones, *muscles, *shared) for word in name}
     known |= other | ends | {*forms, *words}
     return _Table(
@@ -101,11 +98,13 @@ def _table():
         muscles=muscles,
         ends=ends,
         shared=shared,
-        groups={
-            name: tuple(map(str.strip, found.split(","))) for name, found in table["groups"].items()
-        },
+        groups={name: _listed(found) for name, found in table["groups"].items()},
         known=known,
     )
+
+
+def _listed(text):
+    return tuple(name.strip() for name in text.split(","))
 
 
 def _places(text):

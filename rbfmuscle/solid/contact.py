@@ -11,6 +11,7 @@ import numpy as np
 from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
 from rbfmuscle.bones.rounded import LEAST_SLOPE, RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import NO_FENCES
@@ -234,21 +235,16 @@ def turn_normals(rounded, pose, here, gap, normal):
     (4, 4), where it has any; the gaps (k,) become the ways along these.
     """
     for k in range(len(here)):
-        x = here[k, 0] - pose[0, 3]
-        y = here[k, 1] - pose[1, 3]
-        z = here[k, 2] - pose[2, 3]
-        _, _, gx, gy, gz = rounded_at(
-            rounded,
-            pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
-            pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
-            pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
-            LEAST_SLOPE,
-        )
+        way = minus(row_of(here, k), (pose[0, 3], pose[1, 3], pose[2, 3]))
+        x = dot((pose[0, 0], pose[1, 0], pose[2, 0]), way)
+        y = dot((pose[0, 1], pose[1, 1], pose[2, 1]), way)
+        z = dot((pose[0, 2], pose[1, 2], pose[2, 2]), way)
+        _, _, gx, gy, gz = rounded_at(rounded, x, y, z, LEAST_SLOPE)
         if np.isnan(gx):
             continue
         along = 0.0
         for a in range(3):
-            turned = pose[a, 0] * gx + pose[a, 1] * gy + pose[a, 2] * gz
+            turned = dot(row_of(pose, a), (gx, gy, gz))
             along += turned * normal[k, a]
             normal[k, a] = turned
         gap[k] /= max(along, LEAST_ALONG)
