@@ -4,17 +4,19 @@ A taut string runs from the muscle's other end past the belly's end and the via 
 insertion, around the bones. It takes up a change of its length as two springs in series do: the
 tendon's strain is `STIFFNESS_RATIO` of the belly's, at most `TENDON_STRAIN`, and zero where the
 string is shorter than at rest. The belly's end lies on the string at the tendon's length from the
-insertion, displaced from it as at rest and out of the bones. All this depends on the poses of the
-bones alone and continuously: a pose has the same ends however it is reached.
+insertion, displaced from it as at rest and out of the bones. Ends that touch each other and lead to
+one bone, as those of two vasti at the patella, have a common string, and slide on each other only
+as far as their tendons keep their lengths. All this depends on the poses of the bones alone and
+continuously: a pose has the same ends however it is reached.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -74,8 +76,19 @@ class Poses(dict[str, Floats]):
         self.tendons: dict[str, TendonLine] = {}
 
     def __missing__(self, name: str) -> Floats:
-        self.tendons[name], self[name] = self._ends[name].place(self)
+        self.tendons[name], self[name] = self._ends[name].place(self, self._ends.values())
         return self[name]
+
+
+class Carried(NamedTuple):
+    """How a string carries the end of a belly: points x at rest to turn x + shift, beside the
+    string as at rest and out of bones.
+    """
+
+    turn: Floats  # (3, 3)
+    shift: Floats  # (3,)
+    strain: float  # of the tendon
+    passed: int  # via points that the end has passed
 
 
 @dataclass(eq=False)
@@ -139,22 +152,17 @@ class TendonEnd:
                 sides[leg] = around[faults.index(min(faults))]
         return sides
 
-    def place(self, poses: Mapping[str, Floats]) -> tuple[TendonLine, Floats]:
+    def place(
+        self, poses: Mapping[str, Floats], others: Iterable[TendonEnd] = ()
+    ) -> tuple[TendonLine, Floats]:
         """The tendon, and the pose (4, 4) of the belly's end from rest to world, at poses (4, 4) of
-        the bones.
+        the bones. ``others`` are ends that may touch it.
         """
-        at_rest, before, along_before = self._rest
-        legs = self._string(poses)
-        longer = sum(map(line_length, legs)) - at_rest
-        tendons = self.length + self.opposite_length
-        belly = max(at_rest - tendons, 0.0)
-        strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
-        length = self.length * (1.0 + min(max(strain, 0.0), TENDON_STRAIN))
-        now, along_now, ended = _point_on(legs, length)
-        turn = self._turn(along_before, along_now, poses)
-        middle = now + turn @ (self.middle - before)
-        middle = middle + self._lift(turn, middle, along_now, poses)
-        passed = max(0, ended - len(self.other) + 1)
+        ends = self._joined(others)
+        carrying = self if len(ends) == 1 else common_end(ends)
+        turn, shift, strain, passed = carrying._carry(poses)
+        middle = turn @ self.middle + shift
+        length = self.length * (1.0 + strain)
         settled = False
         for _ in range(STEPS):
             tendon = self._tendon(middle, passed, poses)
@@ -173,6 +181,40 @@ class TendonEnd:
         pose[:3, :3], pose[:3, 3] = turn, middle - turn @ self.middle
         line = _lifted(_with_nodes(tendon), self.obstacles, self.radii[1], poses)
         return TendonLine(line, self.radii, settled), pose
+
+    def _joined(self, ends: Iterable[TendonEnd]) -> tuple[TendonEnd, ...]:
+        """This end, and those of others that have a common string with it: they touch each other,
+        and the same bones hold their strings.
+        """
+        found = {self}
+        left = [end for end in ends if end is not self and end._bones == self._bones]
+        while touching := {end for end in left if any(map(end._touches, found))} - found:
+            found |= touching
+        return tuple(sorted(found, key=lambda end: end.name))
+
+    def _touches(self, other: TendonEnd) -> bool:
+        away = float(np.linalg.norm(self.middle - other.middle))
+        return away < self.radii[0] + other.radii[0]
+
+    @cached_property
+    def _bones(self) -> tuple[list[str], list[str]]:
+        """Names of those that hold the string's fixed points before and after the end."""
+        return [bone for bone, _ in self.other], [bone for bone, _ in self.line]
+
+    def _carry(self, poses: Mapping[str, Floats]) -> Carried:
+        at_rest, before, along_before = self._rest
+        legs = self._string(poses)
+        longer = sum(map(line_length, legs)) - at_rest
+        tendons = self.length + self.opposite_length
+        belly = max(at_rest - tendons, 0.0)
+        strain = STIFFNESS_RATIO * longer / max(belly + STIFFNESS_RATIO * tendons, 1e-300)
+        strain = min(max(strain, 0.0), TENDON_STRAIN)
+        now, along_now, ended = _point_on(legs, self.length * (1.0 + strain))
+        turn = self._turn(along_before, along_now, poses)
+        middle = now + turn @ (self.middle - before)
+        middle = middle + self._lift(turn, middle, along_now, poses)
+        passed = max(0, ended - len(self.other) + 1)
+        return Carried(turn, middle - turn @ self.middle, strain, passed)
 
     def _lift(
         self, turn: Floats, middle: Floats, direction: Floats, poses: Mapping[str, Floats]
@@ -236,6 +278,29 @@ class TendonEnd:
         share = way[0] / max(sum(way), 1e-300)
         angle = share * np.arctan2(skew @ now, np.trace(twist) - 1.0)
         return rotation_about(now, float(angle), np.zeros(3))[:3, :3] @ first
+
+
+@lru_cache(maxsize=64)
+def common_end(ends: tuple[TendonEnd, ...]) -> TendonEnd:
+    """One end in place of some that touch each other, on the mean of their strings."""
+    areas = np.array([end.radii[0] ** 2 for end in ends])
+
+    def mean(points: Iterable[Floats]) -> Floats:
+        return np.average(list(points), axis=0, weights=areas)
+
+    def means(places: Iterable[list[BonePoint]]) -> list[BonePoint]:
+        return [(stop[0][0], mean(point for _, point in stop)) for stop in zip(*places)]
+
+    return TendonEnd(
+        name=" and ".join(end.name for end in ends),
+        patch=np.concatenate([end.patch for end in ends]),
+        middle=mean(end.middle for end in ends),
+        radii=(float(np.sqrt(areas.sum())), max(end.radii[1] for end in ends)),
+        line=means(end.line for end in ends),
+        other=means(end.other for end in ends),
+        opposite_length=float(np.average([end.opposite_length for end in ends], weights=areas)),
+        obstacles=ends[0].obstacles,
+    )
 
 
 def _too_deep(line: Floats, bones: Sequence[Bone], radius: float) -> float:

@@ -16,7 +16,7 @@ from rbfmuscle.recording import Run
 from rbfmuscle.run.appearance import LONGEST_TAPER, TAPER, tendon_mesh
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.options import TENDON_STRAIN
-from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, TendonEnd, TendonLine
+from rbfmuscle.scene.tendons import AT_REST, STIFFNESS_RATIO, Poses, TendonEnd, TendonLine
 
 
 def placed(scene, bend, turn=0.0):
@@ -281,6 +281,35 @@ def test_a_tendon_that_does_not_come_to_its_length_is_an_event(monkeypatch):
     # No difference is small enough.
     monkeypatch.setattr("rbfmuscle.scene.tendons.TOLERANCE", -1.0)
     assert (2, "iteration_cap") in actions()
+
+
+def test_ends_that_touch_each_other_stay_side_by_side_where_a_bone_lifts_one():
+    scene = rm.Scene("block under two ends", units="mm")
+    block = trimesh.creation.box((20.0, 40.0, 40.0)).apply_translation([-13.0, 0.0, 0.0])
+    scene.add_bone("block", block)
+
+    def end(name, x):
+        return TendonEnd(
+            name=name,
+            patch=np.array([x, 0.0, 0.0]) + 2.0 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0]]),
+            middle=np.array([x, 0.0, 0.0]),
+            radii=(2.5, 1.0),
+            line=[("limb", np.array([x + 3.0, 0.0, -60.0]))],
+            other=[("trunk", np.array([x + 3.0, 0.0, 60.0]))],
+            obstacles=scene.bones,
+        )
+
+    ends = [end("under", 0.0), end("on it", 4.0), end("apart", 12.0)]
+    pushed = np.eye(4)
+    pushed[0, 3] = 4.0  # its side goes from -3 to 1, and the lowest point of the ends is at -2
+    for order in (ends, ends[::-1]):
+        bones = {"block": pushed, "limb": np.eye(4), "trunk": np.eye(4)}
+        poses = Poses(bones, {end.name: end for end in order})
+        shifts = [poses[end.name][0, 3] for end in ends]
+        np.testing.assert_allclose(shifts, [3.0, 3.0, 0.0], atol=1e-6)
+        for name, end_ in zip(poses.tendons, order):
+            assert poses.tendons[name].settled
+            assert line_length(poses.tendons[name].points) == pytest.approx(end_.length, rel=1e-6)
 
 
 def test_an_end_goes_straight_to_its_via_point_when_a_corner_of_bone_comes_before_it(leg_data):
