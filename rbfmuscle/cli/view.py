@@ -127,9 +127,8 @@ def _draw(opened, model, stops, path):
     """
     from rbfmuscle.display.pictures import check_picture, render_run
     from rbfmuscle.recording import simulate
-    from rbfmuscle.scene.motion import inner_value, rest_coordinates
+    from rbfmuscle.scene.motion import coordinate_limits, inner_value, rest_coordinates
     from rbfmuscle.scene.objects import Motion
-    from rbfmuscle.simulation.live import coordinate_limits
 
     check_picture(path)
     if not isinstance(opened, dict):  # a motion from rest to the pose

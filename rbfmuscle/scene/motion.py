@@ -18,6 +18,8 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.validation import SceneError, did_you_mean
 
 SHIFT_LEVER = 50.0  # lever [mm] at which a shift of a joint is counted as a turn
+# Range of a coordinate around rest where the scene's motion does not exceed it [degree, mm].
+FREE_RANGE = 30.0
 
 
 def rest_coordinates(scene: Scene) -> dict[str, float]:
@@ -50,6 +52,31 @@ def bone_poses(scene: Scene, coordinates: dict[str, float]) -> Poses:
         [bone.name for bone in scene.bones], scene.joints, scene.couplings, coordinates
     )
     return Poses(poses, {end.name: end for muscle in scene.muscles for end in muscle.tendons})
+
+
+def coordinate_limits(scene: Scene) -> dict[str, tuple[float, float]]:
+    """Return the range [radian or scene unit] of each free coordinate: its own with the rest value,
+    or where it has none the motion's and 30 degrees (30 mm) both ways.
+
+    Coordinates that are coupled or locked are left out.
+    """
+    followers = {coupling.coordinate for coupling in scene.couplings}
+    limits = {}
+    for name, coordinate in all_coordinates(scene.joints).items():
+        if name in followers or coordinate.locked:
+            continue
+        free = (
+            from_mm(FREE_RANGE, scene.units)
+            if coordinate.motion == "translation"
+            else math.radians(FREE_RANGE)
+        )
+        values = [frame.get(name, coordinate.rest) for frame in scene.motion.frames]
+        low, high = min([coordinate.rest - free, *values]), max([coordinate.rest + free, *values])
+        if coordinate.range is not None and coordinate.range[0] < coordinate.range[1]:
+            low = min(coordinate.range[0], coordinate.rest)
+            high = max(coordinate.range[1], coordinate.rest)
+        limits[name] = (low, high)
+    return limits
 
 
 def step_angle(

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import NamedTuple
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.threads import blas_limited, each, in_stages
@@ -14,21 +13,12 @@ from rbfmuscle.scene.tendons import Poses
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
 from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import Event, Frame, ModelSurface, MuscleModel
-from rbfmuscle.simulation.group import Group, GroupState
-from rbfmuscle.simulation.neighbours import Link, connected, find_links
+from rbfmuscle.simulation.group import Group
+from rbfmuscle.simulation.neighbours import NEVER_MET, Link, connected, find_links
 from rbfmuscle.simulation.stepper import MuscleStepper, keep_initial_overlap
 from rbfmuscle.simulation.substeps import PoseCache
 
 Path = tuple[list[dict[str, float]], list[dict[str, float]]]
-
-
-class LoopState(NamedTuple):
-    """What changes of a `FrameLoop` from frame to frame."""
-
-    here: dict[str, float]
-    activations: dict[str, float]
-    next_index: int
-    groups: list[GroupState]
 
 
 class FrameLoop:
@@ -88,18 +78,18 @@ class FrameLoop:
             each(keep_initial_overlap, self.steppers)
             self.groups = [_group(self.steppers, members, links) for members in joined]
 
-    def snapshot(self) -> LoopState:
-        """The state between two frames, for :meth:`restore`; times are none of it."""
-        groups = [group.snapshot() for group in self.groups]
-        return LoopState(self.here, self.activations.here, self._next_index, groups)
-
-    def restore(self, state: LoopState) -> None:
-        """Return to a snapshot, which stays valid: what is asked for from here on comes out alike
-        to the bit.
+    def return_to_rest(self) -> None:
+        """Return to the state before the first frame: what is asked for from here on comes out
+        alike to the bit.
         """
-        self.here, self.activations.here, self._next_index, groups = state
-        for group, known in zip(self.groups, groups):
-            group.restore(known)
+        self.here = {}
+        self.activations.here = dict.fromkeys(self.activations.here, 0.0)
+        self._next_index = 0
+        for group in self.groups:
+            group.neighbours.state = NEVER_MET
+        for stepper in self.steppers:
+            stepper.return_to_rest()
+            keep_initial_overlap(stepper)
 
     def at_rest(self) -> tuple[dict[str, ModelSurface], Poses]:
         """Surfaces of the muscles before the first frame, by muscle, and the poses of the bones

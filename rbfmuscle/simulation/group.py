@@ -19,7 +19,7 @@ from rbfmuscle.scene.frames import interpolate
 from rbfmuscle.scene.motion import step_angle
 from rbfmuscle.simulation.contact import NO_FENCES, Fences
 from rbfmuscle.simulation.neighbours import Link, Neighbours, NeighbourState
-from rbfmuscle.simulation.stepper import MuscleStepper, Path, StepperState
+from rbfmuscle.simulation.stepper import MuscleStepper, Path
 from rbfmuscle.simulation.substeps import Coordinates
 from rbfmuscle.simulation.touching import settle
 from rbfmuscle.simulation.tunnelling import Crossing, one_sided_planes
@@ -30,10 +30,6 @@ FENCES = 4
 # Sub-steps are not halved below this angle [radian].
 SMALLEST_STEP = math.radians(0.1)
 FAILURES = np.linalg.LinAlgError, FloatingPointError, NotFiniteError
-
-
-# What changes of a group between sub-steps.
-GroupState = tuple[list[StepperState], NeighbourState]
 
 
 class Saved(NamedTuple):
@@ -144,16 +140,6 @@ class Group:
         for stepper, solid in zip(self.steppers, solids):
             stepper.times["time_solve"] += elapsed * solid.iterations / total
             stepper.solves += 1
-
-    def snapshot(self) -> GroupState:
-        """The state, for :meth:`restore`."""
-        return [stepper.snapshot() for stepper in self.steppers], self.neighbours.state
-
-    def restore(self, state: GroupState) -> None:
-        """Return to a snapshot, which stays valid."""
-        steppers, self.neighbours.state = state
-        for stepper, known in zip(self.steppers, steppers):
-            stepper.restore(known)
 
     def _take_back(self, saved: Saved) -> None:
         for stepper, state in zip(self.steppers, saved.models):

@@ -47,6 +47,9 @@ class NeighbourState(NamedTuple):
     near: Mapping[Link, Integers]
 
 
+NEVER_MET = NeighbourState({}, (), {})
+
+
 class Neighbours:
     """The contacts between the muscles of a group, in their rest state.
 
@@ -65,7 +68,7 @@ class Neighbours:
 
     def __init__(self, steppers: Sequence[MuscleStepper], links: Sequence[Link]) -> None:
         self.links = sorted({*links, *(link[::-1] for link in links)})
-        self.state = NeighbourState({}, (), {})
+        self.state = NEVER_MET
         self.bodies: list[Body] = []
         # By muscle, for each of its shown points the nearest of those that meet neighbours; they
         # stay so, as they move together.

@@ -43,6 +43,9 @@ class RigidState(NamedTuple):
     moved: bool  # whether it was moved since the last frame
 
 
+NEVER_SOLVED = RigidState(None, IDENTITY, False)
+
+
 class RigidTransport:
     """Moves one muscle rigidly where its bones do; for a muscle that neither slides on neighbours
     nor contracts.
@@ -66,7 +69,7 @@ class RigidTransport:
         # All that holds it, as seen from the first, and the first as seen from another bone.
         self._apart = _at_rest(np.arange(1, count), corners[1:], ARC * size, count)
         self._whole = _at_rest(np.array([1]), corners[:1], ARC * size, 2)
-        self.state = RigidState(None, IDENTITY, False)
+        self.state = NEVER_SOLVED
 
     def keeps_shape(self, after: Mapping[str, Floats]) -> bool:
         """Whether the bones that hold the muscle stand to each other as when it was solved last."""

@@ -13,13 +13,13 @@ from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.scene.motion import shown_value, unit_sign
 from rbfmuscle.scene.objects import from_mm
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.scene.tendons import Poses
+from rbfmuscle.scene.tendons import AT_REST, Poses
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import Event, ModelSurface, MuscleModel
 from rbfmuscle.simulation.rigid_transport import (
     IDENTITY,
+    NEVER_SOLVED,
     MuscleStatus,
-    RigidState,
     RigidTransport,
 )
 from rbfmuscle.simulation.substeps import PoseCache, SubSteps
@@ -46,19 +46,6 @@ class Path(NamedTuple):
     ) -> Path:
         """The way from coordinates to others, whose poses a function gives."""
         return cls(before, after, poses(before), poses(after))
-
-
-class StepperState(NamedTuple):
-    """What changes of a muscle, its obstacles and its events between sub-steps."""
-
-    model: object
-    poses: Mapping[str, Floats]
-    rigid_transport: RigidState
-    shown: ModelSurface | None
-    events: dict[tuple[int, str, str], int]
-    frame: int
-    solves: int
-    unresolved: bool
 
 
 class MuscleStepper:
@@ -96,6 +83,7 @@ class MuscleStepper:
         # Whether points crossed a bone in this frame or the last that no step resolved: halving is
         # not tried again.
         self.unresolved = False
+        self._rest = model.snapshot()
 
     def split(self, before: dict[str, float], after: dict[str, float]) -> list[dict[str, float]]:
         """Coordinates of the sub-steps to the next frame; SolveError where there are too many."""
@@ -189,29 +177,15 @@ class MuscleStepper:
             MuscleStatus("solved" if solves else "carried" if moved else "skipped", solves),
         )
 
-    def snapshot(self) -> StepperState:
-        """The state, for :meth:`restore`; times are none of it."""
-        return StepperState(
-            self.model.snapshot(),
-            self.contacts.poses,
-            self.rigid_transport.state,
-            self._shown,
-            dict(self.events),
-            self.frame,
-            self.solves,
-            self.unresolved,
-        )
-
-    def restore(self, state: StepperState) -> None:
-        """Return to a snapshot, which stays valid."""
-        self.model.restore(state.model)
-        self.contacts.move(state.poses)
-        self.rigid_transport.state = state.rigid_transport
-        self._shown = state.shown
-        self.events = dict(state.events)
-        self.frame = state.frame
-        self.solves = state.solves
-        self.unresolved = state.unresolved
+    def return_to_rest(self) -> None:
+        """Return to the state before the first sub-step; times stay."""
+        self.model.restore(self._rest)
+        self.contacts.move(AT_REST)
+        self.rigid_transport.state = NEVER_SOLVED
+        self._shown = None
+        self.events = {}
+        self.frame, self.solves = 0, 0
+        self.unresolved = False
 
 
 def keep_initial_overlap(stepper: MuscleStepper) -> None:

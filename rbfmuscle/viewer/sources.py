@@ -1,5 +1,6 @@
 """What a viewer shows: a scene moved by hand, or saved runs scrubbed by frame; no browser here."""
 
+import copy
 import math
 from collections.abc import Mapping
 from functools import cached_property
@@ -22,12 +23,20 @@ from rbfmuscle.run.data import RunData, frame_caption
 from rbfmuscle.scene.activation import STEP
 from rbfmuscle.scene.check import stated_doubts
 from rbfmuscle.scene.joints import all_coordinates
-from rbfmuscle.scene.motion import bone_poses, inner_value, shown_value, unit_sign
-from rbfmuscle.scene.objects import body_axes, from_mm
+from rbfmuscle.scene.motion import (
+    SHIFT_LEVER,
+    bone_poses,
+    coordinate_limits,
+    inner_value,
+    shown_value,
+    unit_sign,
+)
+from rbfmuscle.scene.objects import Motion, body_axes, from_mm
 from rbfmuscle.scene.scene import Scene, doubtful, require_complete
 from rbfmuscle.scene.tendons import tendon_name
+from rbfmuscle.simulation.contact_pairs import build_fields, find_contact_pairs
 from rbfmuscle.simulation.frame import FibreLines, Frame, Mesh, MuscleModel
-from rbfmuscle.simulation.live import LiveSession, live_fields
+from rbfmuscle.simulation.frame_loop import FrameLoop
 from rbfmuscle.validation import UsageError
 
 REACH = 25.0  # of a joint's axis to either side of its centre [mm]
@@ -137,41 +146,58 @@ class LiveSource:
         coarse = {name: clustered(*mesh, REST_TRIANGLES) for name, mesh in self.muscles.items()}
         self.rest = Picture(bone_poses(scene, {}), coarse, {}, {}, {}, "")
         self.marks = scene_marks(scene)
-        session = LiveSession(scene, bone_sdfs={})
+        known, limits = all_coordinates(scene.joints), coordinate_limits(scene)
         self.controls: dict[str, Control] = {}
-        for name, limits in session.limits.items():
+        for name, ends in limits.items():
             group, _, label = name.rpartition(".")
             unit = unit_sign(scene, name).strip()
-            ends = (round(shown_value(scene, name, x), 9) for x in (*limits, session.rest[name]))
-            self.controls[name] = Control(group, f"{label} [{unit}]" if unit else label, *ends)
-        for name in session.activation:
-            self.controls[ACTIVATION + name] = Control("Activation", name, 0.0, 1.0, 0.0)
+            shown = (round(shown_value(scene, name, x), 9) for x in (*ends, known[name].rest))
+            self.controls[name] = Control(group, f"{label} [{unit}]" if unit else label, *shown)
+        for muscle in scene.muscles:
+            if muscle.contraction is not None:
+                name = ACTIVATION + muscle.name
+                self.controls[name] = Control("Activation", muscle.name, 0.0, 1.0, 0.0)
         self.motion = [
-            {n: shown_value(scene, n, x) for n, x in frame.items() if n in session.limits}
+            {n: shown_value(scene, n, x) for n, x in frame.items() if n in limits}
             for frame in scene.motion.frames
         ]
 
     @cached_property
     def fields(self) -> Mapping[str, BoneSDF]:
-        """Distance fields of the bones, built when a model first asks for them."""
-        return live_fields(self.scene)
+        """Distance fields of the bones in reach of a muscle within the coordinates' limits, built
+        when a model first asks for them.
+        """
+        return build_fields(self.scene, find_contact_pairs(_wide_scene(self.scene)))
 
     def figure(self, choice: str) -> "LiveFigure":
         """A model of every muscle, at rest."""
         scene = self.scene if choice == self.choices[0] else self.scene.with_options(model=choice)
-        return LiveFigure(LiveSession(scene, bone_sdfs=self.fields), build_models(scene))
+        return LiveFigure(scene, build_models(scene), self.fields)
 
 
 class LiveFigure:
-    """New models of a session's muscles that follow coordinates set by hand."""
+    """New models of a scene's muscles that follow coordinates and activations set by hand.
 
-    def __init__(self, session: LiveSession, models: list[MuscleModel]) -> None:
-        self.session = session
-        self._unfinished = True
-        scene = session.scene
-        self._bundles = build_bundles(scene, models)
+    Coordinates, ``here`` and at their ``target``, are in radian or scene unit; ``activation`` holds
+    the target, 0 to 1, of the muscles that contract.
+    """
+
+    def __init__(
+        self, scene: Scene, models: list[MuscleModel], fields: Mapping[str, BoneSDF]
+    ) -> None:
+        self.scene = scene
+        self.models = models
+        self._loop = FrameLoop(_wide_scene(scene), models, bone_sdfs=fields)
+        self._limits = coordinate_limits(scene)
         known = all_coordinates(scene.joints)
+        self._rest = {name: known[name].rest for name in self._limits}
+        self.here, self.target = dict(self._rest), dict(self._rest)
+        self.activation = {m.name: 0.0 for m in scene.muscles if m.contraction is not None}
+        self._unfinished = True
+        self._bundles = build_bundles(scene, models)
         shifts = {name for name, fact in known.items() if fact.motion == "translation"}
+        #: A shift counts as the turn that moves a place at this lever as far.
+        self._lever = dict.fromkeys(shifts, from_mm(SHIFT_LEVER, scene.units))
         self._reach = dict.fromkeys(shifts, from_mm(ARM_REACH, scene.units))
         meshes = {model.name: model.material_mesh() for model in models}
         self._lines = {
@@ -181,42 +207,60 @@ class LiveFigure:
         }
         # Coordinates and lengths of muscles in the last pictures.
         self._trail: list[tuple[dict[str, float], list[float]]] = []
-        self.stride = math.radians(scene.contact.substep_angle)
-        session.use(models)
+        self._stride = math.radians(scene.contact.substep_angle)
 
     def set(self, name: str, value: float) -> None:
-        """Give a control a new target."""
-        if name in self.session.limits:
-            self.session.set(name, inner_value(self.session.scene, name, value))
+        """Give a control a new target, kept within its limits."""
+        if name in self._limits:
+            low, high = self._limits[name]
+            self.target[name] = min(max(inner_value(self.scene, name, value), low), high)
         else:
-            self.session.activate(name.removeprefix(ACTIVATION), value)
+            self.activation[name.removeprefix(ACTIVATION)] = min(max(value, 0.0), 1.0)
 
     def rest(self) -> None:
         """Put models and bones back to rest; the target stays."""
-        self.session.reset()
+        self._loop.return_to_rest()
+        self.here = dict(self._rest)
         self._trail = []
         self._unfinished = True
 
     @property
+    def arrived(self) -> bool:
+        """Whether coordinates and activations have reached their targets."""
+        return self._within(1e-9, 1e-9)
+
+    @property
     def pending(self) -> bool:
         """Whether there is something new to show."""
-        return self._unfinished or not self.session.arrived
+        return self._unfinished or not self.arrived
 
     @property
     def near(self) -> bool:
         """Whether the next picture shows the target."""
-        return self.session.within(self.stride, STEP)
+        return self._within(self._stride, STEP)
 
     def advance(self, *, coarse: bool = False) -> Picture:
         """Go one sub-step further; coarse shows the material where it is and leaves fit and cut for
         later.
+
+        Raises SolveError if a muscle cannot be solved; `rest` goes back to rest.
         """
-        frame = self.session.advance(self.stride, surfaces=not coarse)
+        self._loop.surfaces = not coarse
+        active = self._loop.activations
+        for name, wanted in self.activation.items():
+            now = active.here[name]
+            active.target[name] = now + min(max(wanted - now, -STEP), STEP)
+        farthest, stop = self._farthest(), dict(self.target)
+        if farthest > self._stride:
+            share = self._stride / farthest
+            stop = {n: here + share * (stop[n] - here) for n, here in self.here.items()}
+        frame = self._loop.advance(stop)
+        self.here = dict(frame.coordinates)
         self._unfinished = coarse
         surfaces = {
             n: (s.vertices, s.faces) for n, s in frame.surfaces.items()
         } or frame.material_meshes
-        meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.session.scene.muscles}
+        meshes = {m.name: tendon_mesh(m, frame.tendons) for m in self.scene.muscles}
         depths = {n: s.quantities.get("solver_penetration_max") for n, s in frame.surfaces.items()}
         return Picture(
             poses=frame.poses,
@@ -227,6 +271,22 @@ class LiveFigure:
             text="",
             fibres={n: b.at(frame.poses, frame.tendons) for n, b in self._bundles.items()},
             moment_arms=self._moment_arms(frame),
+        )
+
+    def _within(self, stride: float, step: float) -> bool:
+        """Whether no coordinate is farther than ``stride`` [radian] from its target, no activation
+        than ``step``.
+        """
+        active = self._loop.activations.here
+        return self._farthest() <= stride and all(
+            abs(value - active[name]) <= step for name, value in self.activation.items()
+        )
+
+    def _farthest(self) -> float:
+        """How far coordinates are from their targets, at most [radian]."""
+        return max(
+            (abs(x - self.here[n]) / self._lever.get(n, 1.0) for n, x in self.target.items()),
+            default=0.0,
         )
 
     def _moment_arms(self, frame: Frame) -> dict[str, float]:
@@ -244,6 +304,17 @@ class LiveFigure:
         path, before = zip(*self._trail)
         found = moment_arms(path, before, self._reach)[-1]
         return {name: float(arm) for arms in found.values() for name, arm in zip(self._lines, arms)}
+
+
+def _wide_scene(scene: Scene) -> Scene:
+    """The scene with a motion that takes each coordinate to its limits."""
+    known, limits = all_coordinates(scene.joints), coordinate_limits(scene)
+    rest, stops = {name: known[name].rest for name in limits}, [{}]
+    for name, ends in limits.items():
+        stops += [{name: value} for end in ends for value in np.linspace(rest[name], end, 4)[1:]]
+    wide = copy.copy(scene)
+    wide.motion = Motion([rest | stop for stop in stops])
+    return wide
 
 
 class SavedSource:

@@ -105,7 +105,7 @@ def test_rest_is_a_rest_and_restore_brings_a_snapshot_back(name):
 
 
 @pytest.mark.parametrize("name", ("rbf", "pbd", "arap-volume"))
-def test_restored_loop_of_neighbours_goes_on_to_the_bit(name):
+def test_loop_of_neighbours_returns_to_rest_to_the_bit(name):
     """Two straps, one on the other, of which one contracts, with the tunnelling test."""
     scene = _scene([0], subdivisions=3)
     above = scene.muscles[0].mesh.copy().apply_translation([0.0, 14.3, 0.0])
@@ -123,14 +123,12 @@ def test_restored_loop_of_neighbours_goes_on_to_the_bit(name):
         shapes = [shown.vertices for shown in frame.surfaces.values()]
         return shapes, [quantities, frame.events, frame.activations, frame.work]
 
-    stops = (6, 0.2), (10, 0.5)
-    go(3, 0.1)
-    state = loop.snapshot()
+    stops = (3, 0.1), (6, 0.2), (10, 0.5)
     first = [go(*stop) for stop in stops]
     (group,) = loop.groups
     assert len(group.steppers) == 2  # they may meet
     assert group.neighbours.state.forces or name != "rbf"  # and RBF muscles press on each other
-    loop.restore(state)
+    loop.return_to_rest()
     for stop, (shapes, facts) in zip(stops, first):
         again, said = go(*stop)
         np.testing.assert_array_equal(again, shapes)

@@ -86,8 +86,8 @@ def test_result_does_not_depend_on_order_or_run_or_named_pairs(pressed, order):
 
 
 @pytest.mark.parametrize("gap", [1.0, 5.0])
-def test_restored_loop_goes_on_to_the_bit(gap):
-    """In touch from the start, or from after the snapshot."""
+def test_loop_returns_to_rest_to_the_bit(gap):
+    """In touch from the start, or later."""
     made, fields = toy.neighbour_scene([{}], gap, neighbours=NeighbourOptions())
     parts = toy.neighbour_parts(made)
     loop = FrameLoop(made, parts.values(), bone_sdfs=fields)
@@ -97,12 +97,10 @@ def test_restored_loop_goes_on_to_the_bit(gap):
     def go(stops):
         return [(f.surfaces, f.events, f.index) for f in map(loop.advance, stops)]
 
-    go(stops[:1])
-    state = loop.snapshot()
-    first = go(stops[1:])
+    first = go(stops)
     for _ in range(2):
-        loop.restore(state)
-        for (shown, *rest), (wanted, *others) in zip(go(stops[1:]), first):
+        loop.return_to_rest()
+        for (shown, *rest), (wanted, *others) in zip(go(stops), first):
             assert rest == others
             for name in parts:
                 np.testing.assert_array_equal(shown[name].vertices, wanted[name].vertices)

@@ -87,7 +87,7 @@ def changed(one, two):
 
 
 def degrees(page, side=0):
-    return float(np.degrees(page.sides[side].figure.session.here["hip.flexion"]))
+    return float(np.degrees(page.sides[side].figure.here["hip.flexion"]))
 
 
 def test_page_shows_bones_muscles_and_numbers(tab):
@@ -172,7 +172,7 @@ def test_buttons_turn_the_camera_of_their_own_browser(page, tab):
 
 
 def test_solve_error_sets_controls_to_rest_and_says_so(page, tab):
-    model = page.sides[0].figure.session.models[0]
+    model = page.sides[0].figure.models[0]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(model, "begin", Mock(side_effect=np.linalg.LinAlgError("planted")))
         page.panel.controls["hip.flexion"].value = 6.0

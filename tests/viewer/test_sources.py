@@ -12,9 +12,9 @@ import rbfmuscle as rm
 from rbfmuscle.run.data import RunData
 from rbfmuscle.scene.bone import BoneDistance
 from rbfmuscle.scene.joints import Coordinate
+from rbfmuscle.scene.motion import coordinate_limits
 from rbfmuscle.scene.options import GuessTable
 from rbfmuscle.simulation.frame_loop import simulate_frames
-from rbfmuscle.simulation.live import LiveSession, coordinate_limits
 from rbfmuscle.viewer import open_server
 from rbfmuscle.viewer.page import Panel
 from rbfmuscle.viewer.side import KINDS, MarkView, vertex_values
@@ -24,14 +24,13 @@ from rbfmuscle.viewer.sources import LiveFigure, LiveSource, Picture, SavedSourc
 @pytest.fixture
 def figure():
     scene, fields = toy_scene.hinged_scene([0, 20, 40])
-    session = LiveSession(scene, bone_sdfs=fields)
-    return LiveFigure(session, [toy_scene.ToyMuscle(m, scene) for m in scene.muscles])
+    return LiveFigure(scene, [toy_scene.ToyMuscle(m, scene) for m in scene.muscles], fields)
 
 
 def go(figure, *, coarse=False):
     count, picture = 0, None
     while figure.pending:
-        picture, count = figure.advance(coarse=coarse and not figure.session.arrived), count + 1
+        picture, count = figure.advance(coarse=coarse and not figure.arrived), count + 1
     return picture, count
 
 
@@ -46,7 +45,7 @@ def test_control_moves_the_muscle_by_sub_steps(figure):
     picture, count = go(figure)
     assert count == 11  # two degrees a picture
     assert not np.allclose(strap(picture), strap(start))
-    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(21.0)
+    assert np.degrees(figure.here["hinge.bend"]) == pytest.approx(21.0)
     figure.set("hinge.bend", 0.0)
     figure.rest()
     again, count = go(figure)
@@ -68,11 +67,11 @@ def test_coarse_pictures_show_the_material_and_end_with_a_full_one(figure):
     go(figure)
     figure.set("hinge.bend", 10.0)
     coarse = figure.advance(coarse=True)
-    np.testing.assert_array_equal(strap(coarse), figure.session.models[0].material_mesh()[0])
+    np.testing.assert_array_equal(strap(coarse), figure.models[0].material_mesh()[0])
     assert coarse.depth == {}  # of the surface, which was not made
     full, _ = go(figure, coarse=True)
     assert set(full.depth) == {"strap"}
-    assert np.degrees(figure.session.here["hinge.bend"]) == pytest.approx(10.0)
+    assert np.degrees(figure.here["hinge.bend"]) == pytest.approx(10.0)
 
 
 def picture_of(vertices, faces):
