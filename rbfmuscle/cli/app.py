@@ -37,7 +37,7 @@ GROUPS = {
     "Look": (view, render, report),
 }
 # Commands that there were, and what replaces them.
-REPLACED = {"plan": "check SCENE --plan"}
+REPLACED = {"plan": "check SCENE --time"}
 app = App(
     name="rbfmuscle",
     help="Muscles as implicit RBF surfaces that move with the bones.",

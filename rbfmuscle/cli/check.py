@@ -1,4 +1,4 @@
-"""``rbfmuscle check``: a scene file, and what a run of it would build."""
+"""``rbfmuscle check``: a scene file, and how long a run of it would take."""
 
 import logging
 import sys
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from rbfmuscle.cli.options import USUAL_WORK, Flag, SceneName, Work, print_result
 from rbfmuscle.progress import Progress, stage
-from rbfmuscle.validation import SceneError, UsageError
+from rbfmuscle.validation import SceneError
 
 if TYPE_CHECKING:
     from rbfmuscle.studies.accuracy import LatticeError
@@ -18,7 +18,6 @@ def check(
     scene: SceneName,
     *,
     picture: Flag = False,
-    plan: Flag = False,
     time: Flag = False,
     accuracy: Flag = False,
     work: Work = USUAL_WORK,
@@ -29,17 +28,13 @@ def check(
     ----------
     picture
         Draw attachments, tendons and joint axes to a PNG beside the scene file.
-    plan
-        List what a run would build: contact pairs, unknowns, sub-steps.
     time
-        With --plan: also build the muscles, solve two frames after the first, and extrapolate to
-        the whole motion; compiling is left out.
+        Build the muscles, solve two frames after the first, and extrapolate to the whole motion;
+        compiling is left out. Also list what was solved: unknowns, bones within reach, sub-steps.
     accuracy
         Run the motion on lattices with the nodes given and twice as many, and tell how far RBF
         muscles are apart.
     """
-    if time and not plan:
-        raise UsageError("--time measures what --plan lists; give check SCENE --plan --time")
     facts: dict[str, object] = {}
     errors: list[LatticeError] = []
     path = scene.with_suffix(".png")
@@ -55,8 +50,9 @@ def check(
         names = [muscle.name for muscle in loaded.muscles]
         # Of the muscles that may touch in the motion.
         pairs = [[names[k] for k in pair] for pair in find_links(loaded, names)] if usable else []
-        if plan and usable:
-            facts["plan"] = _plan(loaded, time)
+        if time and usable:
+            with stage("solving two frames"):
+                facts["time"] = _measure_time(loaded)
         if accuracy and usable:
             from rbfmuscle.studies.accuracy import discretisation_error
 
@@ -72,7 +68,7 @@ def check(
 
     attached = attachment_facts(loaded)
     lines = [*_scene_lines(loaded, pairs, attached), *map(str, findings)]
-    lines += _plan_lines(facts["plan"]) if "plan" in facts else ()
+    lines += _time_lines(facts["time"]) if "time" in facts else ()
     for error in errors:
         rms, greatest = (f"{value:.2g} {loaded.units}" for value in (error.rms, error.greatest))
         lines.append(
@@ -169,23 +165,11 @@ def _scene_lines(scene, pairs, attached):
             yield f"    can touch {', '.join(others)}"
 
 
-def _plan(scene, timed):
-    from rbfmuscle.models import solved_points
-    from rbfmuscle.simulation.plan import plan_scene
-
-    made = plan_scene(scene)
-    for muscle, facts in zip(scene.muscles, made["muscles"]):
-        facts["points"] = solved_points(muscle, scene)
-    if timed:
-        with stage("solving two frames"):
-            made["time"] = _measure_time(scene)
-    return made
-
-
 def _measure_time(scene):
     """Wall time of a run without report, pictures and files [s], extrapolated from its first three
-    frames once all is compiled.
+    frames once all is compiled, and what these frames solved.
     """
+    from rbfmuscle.models import solved_points
     from rbfmuscle.recording import simulate
 
     simulate(scene, frames=slice(0, 2))  # compiles what the frames need
@@ -196,25 +180,33 @@ def _measure_time(scene):
         spent / count if len(frames) < 2 else sum(f.wall for f in frames[1:]) / (len(frames) - 1)
     )
     build = max(0.0, spent - frame * (len(frames) - 1))
-    return {"build": build, "frame": frame, "total": build + frame * (count - 1)}
+    muscles = [
+        {
+            "name": muscle.name,
+            "points": solved_points(muscle, scene),
+            "bones": frames[0].bones[muscle.name].names,
+            "substeps": sum(frame.work[muscle.name].substeps for frame in frames),
+        }
+        for muscle in scene.muscles
+    ]
+    return {
+        "build": build,
+        "frame": frame,
+        "total": build + frame * (count - 1),
+        "frames": len(frames),
+        "muscles": muscles,
+    }
 
 
-def _plan_lines(made):
-    yield f"{made['frames']} frames in {made['substeps']} sub-steps"
-    for muscle in made["muscles"]:
+def _time_lines(spent):
+    for muscle in spent["muscles"]:
         yield (
-            f"muscle {muscle['name']}: {muscle['model']}, {muscle['points']}, can meet "
-            f"{', '.join(muscle['bones']) or 'no bone'}; solved in {muscle['substeps']} sub-steps"
+            f"muscle {muscle['name']}: {muscle['points']}; {spent['frames']} frames take "
+            f"{muscle['substeps']} sub-steps, within reach of "
+            f"{', '.join(muscle['bones']) or 'no bone'}"
         )
-    for field in made["fields"]:
-        yield (
-            f"field of {field['bone']}: {field['share']:.0%} of its box, {field['triangles']} "
-            "triangles"
-        )
-    if "time" in made:
-        spent = made["time"]
-        yield (
-            f"expected time: {spent['total']:.3g} s without report, pictures and files; build and "
-            "first frame "
-            f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
-        )
+    yield (
+        f"expected time: {spent['total']:.3g} s without report, pictures and files; build and "
+        "first frame "
+        f"{spent['build']:.2g} s, {1e3 * spent['frame']:.3g} ms per frame"
+    )

@@ -71,15 +71,6 @@ class RigidTransport:
         self._whole = _at_rest(np.array([1]), corners[:1], ARC * size, 2)
         self.state = NEVER_SOLVED
 
-    def keeps_shape(self, after: Mapping[str, Floats]) -> bool:
-        """Whether the bones that hold the muscle stand to each other as when it was solved last."""
-        solved = self.state.solved
-        return solved is None or self._stand_alike(solved, self._stacked(after))
-
-    def note_solved(self, poses: Mapping[str, Floats]) -> None:
-        """Take the poses in which the muscle was solved."""
-        self.state = self.state._replace(solved=self._stacked(poses))
-
     def try_carry(
         self,
         model: MuscleModel,

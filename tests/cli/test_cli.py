@@ -159,13 +159,12 @@ class TestErrors:
         ("arguments", "code", "words"),
         [
             ("rum", 2, "run"),
-            ("plan arm.toml", 2, "there is no command 'plan'; use 'rbfmuscle check SCENE --plan'"),
+            ("plan arm.toml", 2, "there is no command 'plan'; use 'rbfmuscle check SCENE --time'"),
             ("run arm.toml -o o --muscle biceps", 2, "Did you mean --muscles?"),
             ("run arm.toml -o o --muscles ,", 2, "--muscles names no muscle"),
             ("run arm.toml -o o --jobs 0", 2, "jobs must be 1 or more"),
             ("check arm.toml --jobs 0", 2, "jobs must be 1 or more"),
             ("export a --format stl obj", 2, "unexpected 'obj'; lists are written with commas"),
-            ("check arm.toml --time", 2, "--time measures what --plan lists"),
             ("kernels biceps.ply -o o --muscles a", 2, "biceps.ply is a mesh"),
             ("new meshes -o o/scene.toml", 2, "give a folder"),
             ("kernels arm.toml -o o --units mm", 2, "units names the unit of a mesh"),
@@ -282,18 +281,20 @@ class TestOtherCommands:
 
             monkeypatch.setattr("rbfmuscle.recording.simulate", solve)
             build = 1 / 64 - frame * (count - 1)
-            found = _measure_time(SimpleNamespace(motion=range(11)))
-            assert found == pytest.approx(
+            found = _measure_time(SimpleNamespace(motion=range(11), muscles=[]))
+            times = {key: found[key] for key in ("build", "frame", "total")}
+            assert times == pytest.approx(
                 {"build": build, "frame": frame, "total": build + 10 * frame}
             )
 
-    def test_check_lists_what_a_run_would_build(self, folder, capsys):
-        words = ("check", folder / "arm.toml", "--plan")
-        code, out, _ = call(capsys, *words)
-        assert code == 0 and "5 frames in 4 sub-steps" in out and "joint elbow" in out
-        assert re.search(r"muscle biceps: rbf, .* can meet ", out) and "expected time" not in out
-        plan = json.loads(call(capsys, *words, "--time", "--json")[1])["plan"]
-        assert plan["frames"] == 5 and set(plan["time"]) == {"build", "frame", "total"}
+    def test_check_lists_what_it_solved_to_tell_the_time(self, folder, capsys):
+        code, out, _ = call(capsys, "check", folder / "arm.toml", "--time")
+        assert code == 0 and "joint elbow" in out and "expected time: " in out
+        assert re.search(r"muscle biceps: \d+ .* 3 frames take 2 sub-steps, within reach of ", out)
+        time = json.loads(call(capsys, "check", folder / "arm.toml", "--time", "--json")[1])["time"]
+        (muscle,) = time["muscles"]
+        assert muscle["name"] == "biceps" and muscle["substeps"] == 2 and muscle["bones"]
+        assert 0.0 < time["frame"] < time["total"]
 
     def test_comparison_fails_on_the_limits_of_its_models(self, folder, tmp_path, capsys):
         words = ("compare", folder / "arm.toml", "-o", tmp_path / "c", "--models", "pbd,xpbd")

@@ -1,13 +1,17 @@
 """Every scene of the real hip and the whole leg: its meshes load, its settings hold, and its motion
-can be planned.
+splits into sub-steps.
 """
+
+import itertools
 
 import pytest
 
 from rbfmuscle.models import check_models
 from rbfmuscle.scene.check import check_initial
+from rbfmuscle.scene.motion import completed
 from rbfmuscle.scene.scene import Scene
-from rbfmuscle.simulation.plan import plan_scene
+from rbfmuscle.simulation.contact_pairs import find_contact_pairs
+from rbfmuscle.simulation.substeps import PoseCache, SubSteps
 from rbfmuscle.validation import SceneError
 
 # Muscles and bones of each scene.
@@ -63,14 +67,16 @@ def _load(path, folder):
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_scene_loads_and_is_planned(data, name, tmp_path):
+def test_scene_loads_and_its_motion_has_sub_steps(data, name, tmp_path):
     scene = _load(data / f"{name}.toml", tmp_path)
     check_models(scene)
     check_initial(scene)
     assert (len(scene.muscles), len(scene.bones)) == SCENES[name]
-    plan = plan_scene(scene)
-    assert plan["frames"] == len(scene.motion) > 1 and plan["substeps"] >= len(scene.motion) - 1
-    assert [muscle["name"] for muscle in plan["muscles"]] == [
-        muscle.name for muscle in scene.muscles
-    ]
-    assert any(muscle["bones"] for muscle in plan["muscles"])
+    pairs, poses = find_contact_pairs(scene), PoseCache(scene)
+    met = {m.name: [bone for name, bone in pairs if name == m.name] for m in scene.muscles}
+    assert any(met.values())
+    cuts = [SubSteps(scene, m, bones=met[m.name], poses=poses) for m in scene.muscles]
+    frames = [completed(scene, frame) for frame in scene.motion.frames]
+    assert len(frames) > 1
+    for before, after in itertools.pairwise(frames):
+        assert any([cut.split(before, after) for cut in cuts])
