@@ -28,10 +28,20 @@ class HalfSpaces(NamedTuple):
     >= 0``.
     """
 
-    point: np.ndarray  # (c,) number of the contact point
-    gap: np.ndarray  # (c,) signed distance now [scene unit], negative is violated
-    normal: np.ndarray  # (c, 3) unit direction of growing distance, world axes
-    source: np.ndarray  # (c,) row of the bone in reach, or -1 for a fence
+    point: Integers  # (c,) place of the point among those that were asked about
+    gap: Floats  # (c,) signed distance now [scene unit], negative is violated
+    normal: Floats  # (c, 3) unit direction of growing distance, world axes
+    source: Integers  # (c,) row of the bone in reach; behind the last one, a fence
+
+    def some(self, rows: Integers | slice) -> HalfSpaces:
+        """Some of them."""
+        return HalfSpaces(self.point[rows], self.gap[rows], self.normal[rows], self.source[rows])
+
+    @classmethod
+    def joined(cls, parts: Sequence[HalfSpaces]) -> HalfSpaces:
+        """The half-spaces of all parts, one after the other."""
+        some = [part for part in parts if len(part.point)]
+        return some[0] if len(some) == 1 else cls(*map(np.concatenate, zip(*(some or parts))))
 
 
 class Fences(NamedTuple):
@@ -45,8 +55,21 @@ class Fences(NamedTuple):
     normal: Floats  # (f, 3) unit
     anchor: Floats  # (f, 3)
 
+    def meet(self, which: Integers, here: Floats, source: int) -> HalfSpaces:
+        """What points ``which`` (m,), in rising order and now ``here`` (m, 3), meet of the fences,
+        whose half-spaces have this ``source``.
+        """
+        if len(self.point) == 0 or len(which) == 0:
+            return NO_HALF_SPACES
+        near = np.minimum(np.searchsorted(which, self.point), len(which) - 1)
+        chosen = np.flatnonzero(which[near] == self.point)
+        near, normal = near[chosen], self.normal[chosen]
+        gap = self.gap[chosen] + np.einsum("fa,fa->f", normal, here[near] - self.anchor[chosen])
+        return HalfSpaces(near, gap, normal, np.full(len(near), source))
+
 
 NO_FENCES = Fences(np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+NO_HALF_SPACES = HalfSpaces(NO_FENCES.point, NO_FENCES.gap, NO_FENCES.normal, NO_FENCES.point)
 
 
 # Grows a box so far that it holds all that can be near the bone in it.
@@ -168,13 +191,9 @@ class BoneContacts:
             near = np.flatnonzero(gap < reach)
             source = np.full(len(near), row)
             found.append(HalfSpaces(self._free[near], gap[near], normal[near], source))
-        fences = self.fences
-        away = points[fences.point] - fences.anchor
-        gap = fences.gap + np.einsum("ij,ij->i", fences.normal, away)
-        near = np.flatnonzero(gap < reach)
-        source = np.full(len(near), -1)
-        found.append(HalfSpaces(fences.point[near], gap[near], fences.normal[near], source))
-        return HalfSpaces(*map(np.concatenate, zip(*found)))
+        fences = self.fences.meet(np.arange(len(points)), points, len(self.bones.names))
+        found.append(fences.some(np.flatnonzero(fences.gap < reach)))
+        return HalfSpaces.joined(found)
 
     def lifted(self, points: Floats) -> Floats:
         """Contact points (n, 3) to be shown: those that stay in a bone, as they overlapped it at

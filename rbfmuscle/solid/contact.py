@@ -4,7 +4,6 @@ Bones are met with their facets rounded, fences where a point would pass through
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -14,24 +13,12 @@ from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
-from rbfmuscle.simulation.contact import NO_FENCES
+from rbfmuscle.simulation.contact import NO_FENCES, HalfSpaces
 from rbfmuscle.solid.kernels import add_rows
 
 # Least cosine of the angle between the normals of a bone and of its rounded surface that counts.
 LEAST_ALONG = 0.5
 MOST_ROWS = 800  # contact points whose rows are kept: more are found anew
-
-
-class Touch(NamedTuple):
-    """Half-spaces: a motion d of a point is admissible where gap + normal · d >= 0."""
-
-    near: Integers  # (c,) place of the point among those that were asked about
-    source: Integers  # (c,) the bones in reach in order, then the fences
-    gap: Floats  # (c,) [scene unit]
-    normal: Floats  # (c, 3) unit
-
-
-NO_TOUCH = Touch(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, 3)))
 
 
 class Obstacles:
@@ -78,20 +65,20 @@ class Obstacles:
         """Which of the free points (n, 3) are nearer to an obstacle than ``reach``."""
         here = points[self.free]
         found = np.zeros(len(points), dtype=np.bool_)
-        touch = self.meet(self.free, here, np.full(len(here), reach))
-        found[self.free[touch.near]] = True
+        met = self.meet(self.free, here, np.full(len(here), reach))
+        found[self.free[met.point]] = True
         return np.flatnonzero(found)
 
-    def meet(self, which: Integers, here: Floats, reach: Floats) -> Touch:
+    def meet(self, which: Integers, here: Floats, reach: Floats) -> HalfSpaces:
         """The half-spaces that points ``which`` (m,), now ``here`` (m, 3), meet within ``reach``
         (m,).
         """
         room = len(which) * len(self.exact)
-        found = Touch(
-            np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room), np.empty((room, 3))
+        found = HalfSpaces(
+            np.empty(room, np.int64), np.empty(room), np.empty((room, 3)), np.empty(room, np.int64)
         )
         unknown = np.empty(len(which), np.int64)
-        parts = [self._meet_fences(which, here)]
+        parts = [self.fences.meet(which, here, len(self.exact))]
         count = 0
         for b in range(len(self.exact)):
             count, lost = meet_bone(
@@ -112,24 +99,23 @@ class Obstacles:
                 some = unknown[:lost]
                 gap, normal = self.ask(b, which[some], here[some], reach[some])
                 near = np.flatnonzero(gap < reach[some])
-                parts.append(Touch(some[near], np.full(len(near), b), gap[near], normal[near]))
-        parts.append(
-            Touch(found.near[:count], found.source[:count], found.gap[:count], found.normal[:count])
-        )
-        return _joined(parts)
+                source = np.full(len(near), b)
+                parts.append(HalfSpaces(some[near], gap[near], normal[near], source))
+        parts.append(found.some(slice(count)))
+        return HalfSpaces.joined(parts)
 
-    def meet_exactly(self, which: Integers, here: Floats, reach: float) -> Touch:
+    def meet_exactly(self, which: Integers, here: Floats, reach: float) -> HalfSpaces:
         """The same with the bones as they are, but along the normals of the rounded ones: those of
         facets turn at once where a point passes an edge.
         """
-        parts = [self._meet_fences(which, here)]
+        parts = [self.fences.meet(which, here, len(self.exact))]
         for b in range(len(self.exact)):
             gap, normal = self.ask(b, which, here, np.full(len(which), reach))
             near = np.flatnonzero(gap < reach)
             gap, normal = gap[near], normal[near]
             turn_normals(self.rounded[b], self.poses[b], here[near], gap, normal)
-            parts.append(Touch(near, np.full(len(near), b), gap, normal))
-        return _joined(parts)
+            parts.append(HalfSpaces(near, gap, normal, np.full(len(near), b)))
+        return HalfSpaces.joined(parts)
 
     def ask(self, b: int, which: Integers, here: Floats, reach: Floats) -> tuple[Floats, Floats]:
         """Gaps (m,) to bone b as it is, at least ``reach`` (m,) where they are more, and its
@@ -143,25 +129,6 @@ class Obstacles:
         for part, found in zip(known, some, strict=True):
             part[which] = found
         return gap + allowed, normal
-
-    def _meet_fences(self, which: Integers, here: Floats) -> Touch:
-        fences = self.fences
-        if len(fences.point) == 0 or len(which) == 0:
-            return NO_TOUCH
-        near = np.minimum(np.searchsorted(which, fences.point), len(which) - 1)
-        chosen = np.flatnonzero(which[near] == fences.point)
-        near, normal = near[chosen], fences.normal[chosen]
-        away = here[near] - fences.anchor[chosen]
-        gap = fences.gap[chosen] + np.einsum("fa,fa->f", normal, away)
-        return Touch(near, np.full(len(near), len(self.exact)), gap, normal)
-
-
-def _joined(parts: Sequence[Touch]) -> Touch:
-    """The half-spaces of all parts, one after the other."""
-    some = [part for part in parts if len(part.near)]
-    if len(some) == 1:
-        return some[0]
-    return Touch(*(np.concatenate(column) for column in zip(NO_TOUCH, *some, strict=True)))
 
 
 @loop
@@ -177,14 +144,14 @@ def meet_bone(
     bound,
     bone,
     count,
-    near,
-    source,
+    point,
     gap,
     normal,
+    source,
     unknown,
 ):
     """Add the half-spaces that points ``here`` (m, 3) meet at one rounded bone within ``reach``
-    (m,) to the ``count`` first rows of a `Touch` with ``bone`` as their source. Returns their
+    (m,) to the ``count`` first rows of `HalfSpaces` with ``bone`` as their source. Returns their
     number then, and that of the points where the rounded bone has no answer, whose places are
     written to ``unknown`` (m,).
 
@@ -220,11 +187,11 @@ def meet_bone(
         for a in range(3):
             anchor[i, a] = local[a]
         if distance < wanted:
-            near[count] = k
-            source[count] = bone
+            point[count] = k
             gap[count] = distance + allowed[i]
             for a in range(3):
                 normal[count, a] = pose[a, 0] * x + pose[a, 1] * y + pose[a, 2] * z
+            source[count] = bone
             count += 1
     return count, lost
 

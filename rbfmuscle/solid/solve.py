@@ -293,14 +293,14 @@ class Settling:
         nodes = self.nodes, self.step, self._push
         carry_steps(self.near, *self.model.embedding, *nodes, MARGIN * size, here, motion, reach)
         found = self.obstacles.meet(self.near, here, reach)
-        point = self.near[found.near]
+        point = self.near[found.point]
         area = np.full(len(point), self.model.area)
         most, softness = self._law(point, area, YIELDING)
         self._asked = Wanted(
             point,
             found.source,
             found.normal,
-            -found.gap - np.einsum("ca,ca->c", found.normal, motion[found.near]),
+            -found.gap - np.einsum("ca,ca->c", found.normal, motion[found.point]),
             softness,
             most,
             self.forces[point, found.source],
@@ -504,13 +504,13 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
     for _ in range(LIFTS):
         here = np.empty((len(solid.near), 3))
         carry(columns, shares, y, here)
-        touch = solid.obstacles.meet_exactly(solid.near, here, MARGIN * size)
-        if touch.gap.min(initial=0.0) >= -TOLERANCE * size:
+        found = solid.obstacles.meet_exactly(solid.near, here, MARGIN * size)
+        if found.gap.min(initial=0.0) >= -TOLERANCE * size:
             return y, False
-        point = solid.near[touch.near]
+        point = solid.near[found.point]
         zero = np.zeros(len(point))
-        wanted = Wanted(point, touch.source, touch.normal, -touch.gap, zero, zero + np.inf, zero)
-        rows = solid.rows_of(point, touch.normal)
+        wanted = Wanted(point, found.source, found.normal, -found.gap, zero, zero + np.inf, zero)
+        rows = solid.rows_of(point, found.normal)
         every = np.arange(len(point))
         force, _ = find_forces(
             {0: wanted}, {0: every}, None, every[:0], {0: rows}, 0.1 * TOLERANCE * size

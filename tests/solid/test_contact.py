@@ -37,7 +37,7 @@ def test_normals_turn_gradually_where_points_in_a_bone_pass_an_edge():
     _, exact = obstacles.ask(0, which, here, np.full(len(here), 1.0))
     assert np.einsum("pa,pa->p", exact[1:], exact[:-1]).min() < 0.1  # at a right angle
     touch = obstacles.meet_exactly(which, here, 1.0)
-    assert (touch.near == which).all()
+    assert (touch.point == which).all()
     np.testing.assert_allclose(np.linalg.norm(touch.normal, axis=1), 1.0, atol=1e-12)
     turns = np.einsum("pa,pa->p", touch.normal[1:], touch.normal[:-1])
     # In steps of 0.07, beside cells of 2.55 over which the bone is rounded.

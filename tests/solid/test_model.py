@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.scene.joints import rotation_about
+from rbfmuscle.simulation.contact import HalfSpaces
 from rbfmuscle.simulation.touching import TOLERANCE, meet, settle
-from rbfmuscle.solid.contact import NO_TOUCH, Touch
 from rbfmuscle.solid.lattice import Lattice
 from rbfmuscle.solid.metric import stiffness_matrix
 from rbfmuscle.solid.model import (
@@ -82,7 +82,7 @@ class Floor:
         near = np.flatnonzero(gap < reach)
         zero = np.zeros(len(near), dtype=np.int64)
         normal = np.tile(self.normal, (len(near), 1))
-        return Touch(near, zero, gap[near], normal) if len(near) else NO_TOUCH
+        return HalfSpaces(near, gap[near], normal, zero)
 
     meet_exactly = meet
 

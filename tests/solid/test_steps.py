@@ -340,7 +340,7 @@ def test_fences_hold_the_points_that_they_name():
     )
     here = np.array([[1.0, 1.0, 1.0], [0.0, 0.0, 4.0]])
     touch = obstacles.meet(np.array([1, 3]), here, np.full(2, 1.0))
-    assert touch.near.tolist() == [1] and touch.source.tolist() == [0]
+    assert touch.point.tolist() == [1] and touch.source.tolist() == [0]
     assert touch.gap == pytest.approx([0.5 + 2.0])
     assert len(obstacles.meet(np.array([1, 2]), here, np.full(2, 1.0)).gap) == 0
 
