@@ -25,7 +25,7 @@ from rbfmuscle.geometry.exact_distance import (
     offset_in_frame,
     record_square,
 )
-from rbfmuscle.geometry.frames import dot, minus, row_of
+from rbfmuscle.geometry.frames import dot, local_point, minus, row_of
 from rbfmuscle.geometry.mesh_distance import half_solid_angle
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
@@ -215,6 +215,17 @@ def distance_at(bone, x, y, z, triangle, stack, squares):
     return side * distance, nx / length, ny / length, nz / length, best
 
 
+@loop
+def least_distance(boxes, point, anchor, bound):
+    """Lower bound of the distance of a point in bone coordinates, three numbers: by the box of the
+    bone, and by the ``bound`` that was known at ``anchor``, where the point was.
+    """
+    moved = minus(point, anchor)
+    least = bound - np.sqrt(dot(moved, moved))
+    beyond = box_square(boxes, 1, *point)
+    return max(least, np.sqrt(beyond)) if beyond > 0.0 else least
+
+
 def distances(
     bone: BoneArrays, pose: Floats, points: Floats, reach: Floats, known: Memory
 ) -> tuple[Floats, Floats]:
@@ -244,26 +255,17 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
     stack = np.empty(STACK, np.int64)
     squares = np.empty(STACK)
     for i in range(len(points)):
-        way = minus(row_of(points, i), (pose[0, 3], pose[1, 3], pose[2, 3]))
-        x = dot((pose[0, 0], pose[1, 0], pose[2, 0]), way)
-        y = dot((pose[0, 1], pose[1, 1], pose[2, 1]), way)
-        z = dot((pose[0, 2], pose[1, 2], pose[2, 2]), way)
-        beyond = box_square(bone.boxes, 1, x, y, z)
-        moved = (x - anchor[i, 0]) ** 2 + (y - anchor[i, 1]) ** 2 + (z - anchor[i, 2]) ** 2
-        least = bound[i] - np.sqrt(moved)
-        if beyond > 0.0:
-            least = max(least, np.sqrt(beyond))
+        local = local_point(pose, row_of(points, i))
+        least = least_distance(bone.boxes, local, row_of(anchor, i), bound[i])
         if least > reach[i]:
             distance[i] = least
             gradient[i] = 0.0
             continue
-        d, gx, gy, gz, best = distance_at(bone, x, y, z, triangle[i], stack, squares)
+        d, gx, gy, gz, best = distance_at(bone, *local, triangle[i], stack, squares)
         distance[i] = d
         for k in range(3):
-            gradient[i, k] = pose[k, 0] * gx + pose[k, 1] * gy + pose[k, 2] * gz
-        anchor[i, 0] = x
-        anchor[i, 1] = y
-        anchor[i, 2] = z
+            gradient[i, k] = dot(row_of(pose, k), (gx, gy, gz))
+            anchor[i, k] = local[k]
         triangle[i] = best
         # The sign of an open mesh may change without a zero between.
         bound[i] = d if len(bone.dipoles) == 0 else -np.inf

@@ -103,6 +103,17 @@ def row_of(rows, k):
 
 
 @loop
+def local_point(pose, point):
+    """A point of three numbers, in world coordinates, as a pose (4, 4) sees it."""
+    way = minus(point, (pose[0, 3], pose[1, 3], pose[2, 3]))
+    return (
+        dot((pose[0, 0], pose[1, 0], pose[2, 0]), way),
+        dot((pose[0, 1], pose[1, 1], pose[2, 1]), way),
+        dot((pose[0, 2], pose[1, 2], pose[2, 2]), way),
+    )
+
+
+@loop
 def turn_towards(m, q):
     """The unit quaternion q a step nearer to the rotational part of a matrix m, given as rows.
 

@@ -176,9 +176,8 @@ class RBFMuscle:
             round_bone(field, self.frame, spacing, region, reach=reach)
             for field, region in zip(bones.fields, bones.regions)
         ]
-        boxes = np.array([field.bounds for field in bones.fields]).reshape(-1, 2, 3)
         exact = [field.arrays for field in bones.fields]
-        return Obstacles(exact, boxes, rounded, contacts.placed, contacts.free, contacts.allowed)
+        return Obstacles(exact, rounded, contacts.placed, contacts.free, contacts.allowed)
 
     def body(self) -> Body:
         """What others meet that touch this muscle, whose solves answer them from then on."""

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.bones.distance import distance_at
+from rbfmuscle.bones.distance import distance_at, least_distance
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.geometry.arrays import Floats, Integers, to_local, to_world
 from rbfmuscle.geometry.exact_distance import (
@@ -27,6 +27,7 @@ from rbfmuscle.geometry.exact_distance import (
     STACK,
     nearest_in_frame,
 )
+from rbfmuscle.geometry.frames import dot, local_point, minus, row_of
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.options import TunnellingOptions
 from rbfmuscle.simulation.contact import BoneContacts, Fences
@@ -197,34 +198,19 @@ def path_loop(
     leaves = len(bone.starts) - 1
     stack = np.empty(STACK, np.int64)
     squares = np.empty(STACK)
-    start = np.empty(3)
-    stop = np.empty(3)
     size = boxes[1, 3] - boxes[1, 0] + boxes[1, 4] - boxes[1, 1] + boxes[1, 5] - boxes[1, 2]
     for i in range(len(begin)):
         near[i] = False
         places[i, 0] = 0.0
         places[i, 1] = 1.0
         cosine[i] = 1.0
-        moved = 0.0
-        length = 0.0
-        apart = False
-        for k in range(3):
-            start[k] = 0.0
-            stop[k] = 0.0
-            for a in range(3):
-                start[k] += before[a, k] * (begin[i, a] - before[a, 3])
-                stop[k] += after[a, k] * (end[i, a] - after[a, 3])
-            moved += (stop[k] - anchor[i, k]) ** 2
-            length += (stop[k] - start[k]) ** 2
-            apart |= (
-                min(start[k], stop[k]) > boxes[1, 3 + k] or max(start[k], stop[k]) < boxes[1, k]
-            )
-        length = np.sqrt(length)
-        if apart or bound[i] - np.sqrt(moved) > length:
+        x, y, z = local_point(before, row_of(begin, i))
+        stop = local_point(after, row_of(end, i))
+        way = minus(stop, (x, y, z))
+        length = np.sqrt(dot(way, way))
+        if least_distance(boxes, stop, row_of(anchor, i), bound[i]) > length:
             continue
-        distance, bx, by, bz, best = distance_at(
-            bone, stop[0], stop[1], stop[2], triangle[i], stack, squares
-        )
+        distance, bx, by, bz, best = distance_at(bone, *stop, triangle[i], stack, squares)
         triangle[i] = best
         bound[i] = distance if len(bone.dipoles) == 0 else -np.inf
         for k in range(3):
@@ -232,12 +218,7 @@ def path_loop(
         if distance > length:
             continue
         near[i] = True
-        x = start[0]
-        y = start[1]
-        z = start[2]
-        dx = stop[0] - x
-        dy = stop[1] - y
-        dz = stop[2] - z
+        dx, dy, dz = way
         # First place and record where the path goes in, last where it comes out, and the last in
         # and first out.
         into = np.inf

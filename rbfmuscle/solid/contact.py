@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop
+from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop, least_distance
 from rbfmuscle.bones.rounded import LEAST_SLOPE, RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.frames import dot, minus, row_of
+from rbfmuscle.geometry.frames import dot, local_point, row_of
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import NO_FENCES, HalfSpaces
@@ -28,8 +28,6 @@ class Obstacles:
     ----------
     exact : sequence of BoneArrays
         The b bones in reach.
-    boxes : (b, 2, 3) ndarray
-        In bone coordinates.
     rounded : sequence of RoundedBone
         The same bones as this muscle meets them.
     poses : (b, 4, 4) ndarray
@@ -43,14 +41,12 @@ class Obstacles:
     def __init__(
         self,
         exact: Sequence[BoneArrays],
-        boxes: Floats,
         rounded: Sequence[RoundedBone],
         poses: Floats,
         free: Booleans,
         allowed: Floats,
     ) -> None:
         self.exact = exact
-        self.boxes = boxes
         self.rounded = rounded
         self.poses = poses
         self.free = np.flatnonzero(free)
@@ -83,8 +79,8 @@ class Obstacles:
         for b in range(len(self.exact)):
             count, lost = meet_bone(
                 self.rounded[b],
+                self.exact[b].boxes,
                 self.poses[b],
-                self.boxes[b],
                 which,
                 here,
                 reach,
@@ -134,8 +130,8 @@ class Obstacles:
 @loop
 def meet_bone(
     rounded,
+    boxes,
     pose,
-    box,
     which,
     here,
     reach,
@@ -157,26 +153,17 @@ def meet_bone(
 
     ``which`` (m,) are the numbers of the points in ``allowed`` (n,), how deep each may be in the
     bone, and in what is known of each: its distance was ``bound`` (n,) at ``anchor`` (n, 3) in bone
-    coordinates, and changes by no more than the point moves. ``box`` (2, 3) is that of the bone.
+    coordinates, and changes by no more than the point moves. ``boxes`` are those of the bone's
+    `BoneArrays`.
     """
-    local = np.empty(3)
     lost = 0
     for k in range(len(which)):
         i = which[k]
-        outside = 0.0
-        moved = 0.0
-        for a in range(3):
-            at = 0.0
-            for b in range(3):
-                at += pose[b, a] * (here[k, b] - pose[b, 3])
-            local[a] = at
-            beyond = max(box[0, a] - at, at - box[1, a], 0.0)
-            outside += beyond * beyond
-            moved += (at - anchor[i, a]) ** 2
+        local = local_point(pose, row_of(here, k))
         wanted = reach[k] - allowed[i]
-        if bound[i] - np.sqrt(moved) >= wanted or (outside > 0.0 and np.sqrt(outside) >= wanted):
+        if least_distance(boxes, local, row_of(anchor, i), bound[i]) >= wanted:
             continue
-        smooth, distance, x, y, z = rounded_at(rounded, local[0], local[1], local[2], LEAST_SLOPE)
+        smooth, distance, x, y, z = rounded_at(rounded, *local, LEAST_SLOPE)
         if np.isnan(distance):
             unknown[lost] = k
             lost += 1
@@ -202,11 +189,8 @@ def turn_normals(rounded, pose, here, gap, normal):
     (4, 4), where it has any; the gaps (k,) become the ways along these.
     """
     for k in range(len(here)):
-        way = minus(row_of(here, k), (pose[0, 3], pose[1, 3], pose[2, 3]))
-        x = dot((pose[0, 0], pose[1, 0], pose[2, 0]), way)
-        y = dot((pose[0, 1], pose[1, 1], pose[2, 1]), way)
-        z = dot((pose[0, 2], pose[1, 2], pose[2, 2]), way)
-        _, _, gx, gy, gz = rounded_at(rounded, x, y, z, LEAST_SLOPE)
+        local = local_point(pose, row_of(here, k))
+        _, _, gx, gy, gz = rounded_at(rounded, *local, LEAST_SLOPE)
         if np.isnan(gx):
             continue
         along = 0.0

@@ -20,7 +20,7 @@ def obstacles_about(pose, count):
     region = np.array([[-20.0] * 3, [20.0] * 3])
     rounded = round_bone(bone, frame, 1.5, region, cache=False, reach=3.0)
     free, allowed = np.ones(count, dtype=bool), np.zeros((1, count))
-    return Obstacles([bone.arrays], bone.bounds[None], [rounded], pose[None], free, allowed)
+    return Obstacles([bone.arrays], [rounded], pose[None], free, allowed)
 
 
 def test_normals_turn_gradually_where_points_in_a_bone_pass_an_edge():

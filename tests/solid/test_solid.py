@@ -73,8 +73,9 @@ class Bar:
         )
         self.model = model if tension else model._replace(end=np.full_like(model.end, -1))
         self.state = rest_state(model)
-        nothing = np.zeros((0, 2, 3)), [], np.zeros((0, 4, 4))
-        self.obstacles = Obstacles([], *nothing, owner < 0, np.zeros((0, len(owner))))
+        self.obstacles = Obstacles(
+            [], [], np.zeros((0, 4, 4)), owner < 0, np.zeros((0, len(owner)))
+        )
         self.poses = np.array([np.eye(4), np.eye(4)])
 
     def with_fibres(self, along, ratio=1.0, slack=1.0):

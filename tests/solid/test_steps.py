@@ -332,8 +332,7 @@ def test_positive_definite_matrices_are_inverted(rng):
 
 
 def test_fences_hold_the_points_that_they_name():
-    nothing = np.zeros((0, 2, 3)), [], np.zeros((0, 4, 4)), np.ones(5, dtype=bool), np.zeros((0, 5))
-    obstacles = Obstacles([], *nothing)
+    obstacles = Obstacles([], [], np.zeros((0, 4, 4)), np.ones(5, dtype=bool), np.zeros((0, 5)))
     up = np.array([[0.0, 0.0, 1.0]])
     obstacles.fences = obstacles.fences._replace(
         point=np.array([3]), gap=np.array([0.5]), normal=up, anchor=2.0 * up
