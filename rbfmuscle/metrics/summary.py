@@ -17,7 +17,9 @@ from rbfmuscle.validation import UsageError, did_you_mean
 
 
 class QuantityFacts(TypedDict, total=False):
-    """What a quantity of a muscle amounts to over the frames [``unit``]; None where it is NaN."""
+    """What a quantity of a muscle amounts to over the frames [``unit``], ``sd`` their standard
+    deviation; None where it is NaN.
+    """
 
     unit: str
     count: int
@@ -26,6 +28,7 @@ class QuantityFacts(TypedDict, total=False):
     min: float
     max: float
     mean: float
+    sd: float
     median: float
     worst: float | None
     worst_frame: int
@@ -203,8 +206,8 @@ class Summary:
         }
 
     def table(self) -> dict[str, dict[str, QuantityFacts]]:
-        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, median, first, last,
-        worst and its frame.
+        """Nested dict: muscle -> quantity -> unit, count, min, max, mean, sd, median, first,
+        last, worst and its frame.
 
         ``worst`` is the value of greatest magnitude, or the least where that is what is limited
         (`LOWER_BOUNDS`). A moment arm is named with its coordinate.
@@ -234,6 +237,7 @@ class Summary:
                 "min": float(finite.min()),
                 "max": float(finite.max()),
                 "mean": float(finite.mean()),
+                "sd": float(finite.std()),
                 "median": float(np.median(finite)),
                 "worst": float(finite[worst]),
                 "worst_frame": int(frames[known][worst]),

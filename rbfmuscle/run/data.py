@@ -84,7 +84,7 @@ class RunData:
     quantities : list of str
         Names of what was measured.
     summary : dict
-        Muscle -> quantity -> min, max, mean, median, worst.
+        Muscle -> quantity -> min, max, mean, sd, median, worst.
     verdict : str
         Which muscles are within all limits, which not, and the worst value.
     events : list of Event

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import numpy as np
 from pydantic import BaseModel
@@ -27,7 +28,7 @@ from rbfmuscle.display.report import packed_scene
 from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.threads import cores_limited, threads_limited
 from rbfmuscle.metrics.metrics import surface_distance
-from rbfmuscle.metrics.quantities import ALL, QUANTITIES, quantity_of, split_name, unit_text
+from rbfmuscle.metrics.quantities import ALL, quantity_of, split_name, unit_text
 from rbfmuscle.metrics.summary import LIMITS, QuantityFacts, shown_number
 from rbfmuscle.models import (
     build_models,
@@ -216,16 +217,17 @@ FIRST = "first model"
 COST = "cost"
 
 
-class Measure(NamedTuple):
+@dataclass(frozen=True)
+class Measure:
     """A row of the table.
 
-    ``kind`` is that of a unit: ``"1"``, ``"length"`` or ``"s"``; ``against`` says what a value is
-    an error of or against; a value is better the smaller its distance from ``ideal``, and
-    differences of less than ``floor`` (millimetres for lengths) do not count.
+    ``unit`` is ``"1"``, ``"s"``, or of lengths the scene's, in `MEASURES` ``"length"``; ``against``
+    says what a value is an error of or against; a value is better the smaller its distance from
+    ``ideal``, and differences of less than ``floor`` (millimetres for lengths) do not count.
     """
 
     title: str
-    kind: str
+    unit: str
     against: str
     floor: float
     meaning: str
@@ -280,6 +282,9 @@ _ROWS: dict[str, tuple] = {
 }
 MEASURES = {name: Measure(*row) for name, row in _ROWS.items()}
 FROM_METRICS = [name for name, m in MEASURES.items() if m.against in (LAW, MESH) and name != DEEPER]
+# Quantities whose means and standard deviations are written, and those that the page shows.
+STATISTICS = (*FROM_METRICS, "length", "moment_arm")
+_STATISTICS_SHOWN = ("length", "moment_arm", "volume_error")
 
 
 VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
@@ -288,30 +293,13 @@ VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
 Values = dict[str, dict[str, float]]
 
 
-class MeasureFacts(BaseModel):
-    """A measure: its unit, and the words of its row of `MEASURES`."""
-
-    unit: str
-    title: str
-    against: str
-    meaning: str
-
-
-class Spread(BaseModel):
-    """Mean and standard deviation over the frames."""
-
-    mean: float
-    sd: float
-
-
 class Comparison(BaseModel, Study):
     """What ``comparison.json`` holds.
 
     ``poses`` are the numbers of the frames at which distances were measured, ``labels`` models as
     tables name them, ``failed`` why models were not solved, ``answer`` all of it in sentences,
     ``within`` how many muscles of each model are within all limits, ``unknowns`` the points that
-    each model solves for, in words, by model and muscle. ``results`` are by model; ``statistics``
-    by model, muscle and quantity, of moment arms ``"moment_arm:COORDINATE"``.
+    each model solves for, in words, by model and muscle. ``results`` are by model.
     """
 
     command: ClassVar[str] = "compare"
@@ -328,9 +316,8 @@ class Comparison(BaseModel, Study):
     answer: str
     within: dict[str, int] = {}
     unknowns: dict[str, dict[str, str]]
-    measures: dict[str, MeasureFacts]
+    measures: dict[str, Measure]
     results: dict[str, Values]
-    statistics: dict[str, dict[str, dict[str, Spread]]]
     machine: dict[str, str | int | None]
     versions: dict[str, str]
 
@@ -359,7 +346,7 @@ class Comparison(BaseModel, Study):
                         yield model, muscle, name, values[name], measure.unit, measure.against
 
 
-FORMAT = 4  # of comparison.json
+FORMAT = 5  # of comparison.json
 
 
 def measure_run(
@@ -406,25 +393,6 @@ def measure_run(
     together["time_build"] = build
     together["time_one_thread"] = one_thread
     found[ALL] = together
-    return found
-
-
-def statistics(saved: RunData) -> dict[str, dict[str, Spread]]:
-    """Mean and standard deviation over the frames, by muscle and quantity; of moment arms the
-    quantity is ``"moment_arm:COORDINATE"``.
-    """
-    found = {}
-    for muscle in saved.muscles:
-        whole = (*FROM_METRICS, "length", "time_frame")
-        series = {name: saved.series(muscle, name)[1] for name in whole}
-        for about in moment_arm_coordinates(saved, muscle):
-            series[f"moment_arm:{about}"] = saved.series(muscle, "moment_arm", about)[1]
-        series["time_frame"] = series["time_frame"][1:]  # the first loads and compiles
-        found[muscle] = {
-            name: Spread(mean=float(values.mean()), sd=float(values.std()))
-            for name, values in series.items()
-            if len(values) and np.isfinite(values).all()
-        }
     return found
 
 
@@ -485,43 +453,36 @@ def write_tables(
         models=list(results),
         labels=labels,
         failed=failed,
-        answer=describe(results, labels, scene.units, beyond),
+        answer=describe(results, labels, beyond),
         within={name: len(runs[name].muscles) - len(found[ALL]) for name, found in beyond.items()},
         unknowns={
             name: {m.name: solved_points(m, variants[name]) for m in variants[name].muscles}
             for name in results
         },
         measures={
-            name: MeasureFacts(
-                unit=unit_text(m.kind, scene.units),
-                title=m.title,
-                against=m.against,
-                meaning=m.meaning,
-            )
-            for name, m in MEASURES.items()
+            name: replace(measure, unit=unit_text(measure.unit, scene.units))
+            for name, measure in MEASURES.items()
         },
         results=results,
-        statistics={name: statistics(run) for name, run in runs.items()},
         machine=machine(),
         versions=versions(),
     )
     write_json(folder / "comparison.json", table.model_dump())
     write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
     rows: list[tuple[object, ...]] = [("model", "muscle", "quantity", "mean", "sd", "unit")]
-    for model, muscles in table.statistics.items():
-        for muscle, quantities in muscles.items():
-            for name, spread in quantities.items():
-                unit = unit_text(QUANTITIES[quantity_of(name)][0], table.units)
-                rows.append((model, muscle, name, spread.mean, spread.sd, unit))
+    rows += [
+        (model, muscle, name, facts["mean"], facts["sd"], facts["unit"])
+        for model, run in runs.items()
+        for muscle, quantities in run.summary.items()
+        for name, facts in quantities.items()
+        if quantity_of(name) in STATISTICS and "sd" in facts
+    ]
     write_csv(folder / "statistics.csv", rows)
     return table
 
 
-# A model keeps out of bones that is no deeper in one [mm].
-KEPT_OUT = 0.3
-# How many quantities beyond limits are named; of depths the sentences say what is beyond rest.
+# How many quantities beyond limits are named.
 MOST_TOLD = 4
-_DEPTHS = ("penetration_max", "bone_penetration_max", "initial_overlap")
 _TIE = 1.05  # models whose values differ by less are equally good
 
 Beyond = Mapping[str, Mapping[str, set[str]]]
@@ -538,31 +499,36 @@ def best_models(results: dict[str, Values], quantity: str, units: str) -> list[s
     values = {name: abs(value - measure.ideal) for name, value in known.items()}
     if measure.against == FIRST or len(values) < 2:
         return []
-    scale = from_mm(1.0, units) if measure.kind == "length" else 1.0
+    scale = from_mm(1.0, units) if measure.unit == "length" else 1.0
     limit = _TIE * min(values.values()) + measure.floor * scale
     return [name for name, value in values.items() if value <= limit]
 
 
 def muscles_beyond(saved: RunData) -> dict[str, set[str]]:
-    """The muscles of a run that are not within a limit, by quantity; under ``"all"`` those that are
-    not within all limits, or not measured for one.
+    """The muscles of a run that are not within a limit, by quantity, `ALL` for the bones; under
+    ``"all"`` those muscles that are not within all limits, or not measured for one.
     """
     found: dict[str, set[str]] = {ALL: set()}
     pairs = [(row.muscle, row.quantity) for row in saved.info.beyond]
-    pairs += [(row.muscle, row.quantity) for row in saved.info.not_measured]
+    pairs += [(row.muscle, row.quantity) for row in saved.info.not_measured if row.muscle != ALL]
     for muscle, quantity in pairs:
-        if muscle in saved.muscles:
+        found.setdefault(quantity_of(quantity), set()).add(muscle)
+        if muscle != ALL:
             found[ALL].add(muscle)
-            found.setdefault(quantity, set()).add(muscle)
     return found
 
 
 def _failures(beyond: Beyond, labels: dict[str, str]) -> list[str]:
-    """For each model what its muscles are not within the limits of, most muscles first."""
+    """For each model what its muscles, or the bones, are not within the limits of, most muscles
+    first.
+    """
     texts = []
     for model, found in beyond.items():
-        named = {quantity: sorted(muscles) for quantity, muscles in found.items() if muscles}
-        named.pop(ALL, None)
+        named = {
+            quantity: sorted("the bones" if name == ALL else name for name in muscles)
+            for quantity, muscles in found.items()
+            if quantity != ALL
+        }
         most = sorted(named, key=lambda quantity: len(named[quantity]), reverse=True)[:MOST_TOLD]
         told = [
             f"{LIMITS[quantity].title} ({listed(named[quantity], MOST_TOLD)})" for quantity in most
@@ -572,107 +538,41 @@ def _failures(beyond: Beyond, labels: dict[str, str]) -> list[str]:
     return texts
 
 
-def _differences(
-    results: dict[str, Values],
-    labels: dict[str, str],
-    units: str,
-    beyond: Beyond,
-) -> list[str]:
-    """Worst values of what most muscles are beyond a limit of, and of the return error, where the
-    models differ in it.
-    """
-    counts = {
-        name: [len(beyond.get(model, {}).get(name, ())) for model in results] for name in MEASURES
-    }
-    told = [name for name, count in counts.items() if any(count) and name not in _DEPTHS]
-    told.sort(key=lambda name: max(counts[name]) - min(counts[name]), reverse=True)
-    texts = []
-    for name in (*told[:MOST_TOLD], "return_rms"):
-        known = [model for model in results if name in results[model][ALL]]
-        best = best_models(results, name, units)
-        if len(best) < len(known) and len(known) > 1:
-            unit = unit_text(MEASURES[name].kind, units)
-            values = [
-                f"{shown_number(results[model][ALL][name], unit)} ({labels[model]})"
-                for model in known
-            ]
-            texts.append(f"{MEASURES[name].title} {', '.join(values)}")
-    return texts
+def describe(results: dict[str, Values], labels: dict[str, str], beyond: Beyond) -> str:
+    """How many muscles of each model are within all limits, what the others are beyond, which model
+    is the best by the limits, and which the quickest.
 
-
-def describe(results: dict[str, Values], labels: dict[str, str], units: str, beyond: Beyond) -> str:
-    """How many muscles of each model are within all limits, what the others are beyond, and where
-    the models differ; then whether the first keeps out of bones, its time against the quickest
-    other one, which is nearest in shape.
-
-    Arguments are those of `write_tables`, ``beyond`` is `muscles_beyond` of each model; distances
-    are to the first model.
+    Arguments are those of `write_tables`, ``beyond`` is `muscles_beyond` of each model.
     """
     muscles = len(next(iter(results.values()))) - 1
-    kept = [
-        f"{muscles - len(found[ALL])} of {muscles} ({labels[name]})"
-        for name, found in beyond.items()
-    ]
-    texts = [f"Muscles within all limits: {', '.join(kept)}"] if kept else []
-    texts += _failures(beyond, labels)
-    if differ := _differences(results, labels, units, beyond):
-        texts.append(f"Worst values: {'; '.join(differ)}")
-    whole = {name: found[ALL] for name, found in results.items()}
-    texts += [*_depths(whole, labels, units), *_times_and_shapes(whole, labels, units)]
+    kept = {name: muscles - len(found[ALL]) for name, found in beyond.items()}
+    counts = [f"{count} of {muscles} ({labels[name]})" for name, count in kept.items()]
+    texts = [f"Muscles within all limits: {', '.join(counts)}", *_failures(beyond, labels)]
     if len(results) > 1:
+        best = [labels[name] for name, count in kept.items() if count == max(kept.values())]
+        texts.append(
+            f"By the limits {' and '.join(best)} are equally good"
+            if len(best) > 1
+            else f"By the limits {best[0]} is the best"
+        )
+        times = {
+            name: found[ALL]["time_frame"]
+            for name, found in results.items()
+            if "time_frame" in found[ALL]
+        }
+        if len(times) > 1:
+            quick = min(times, key=times.__getitem__)
+            longer = [
+                f"{labels[name]} takes {time / times[quick]:.2g} times as long"
+                for name, time in times.items()
+                if name != quick
+            ]
+            texts.append(f"{labels[quick]} is the quickest: {', '.join(longer)}")
         texts.append(
             "The comparison does not show which shape is right; docs/validation.md compares with "
             "finite elements"
         )
     return f"{'. '.join(texts)}."
-
-
-def _depths(whole: Values, labels: dict[str, str], units: str) -> list[str]:
-    """Whether the first model keeps out of bones, and how deep the others are; ``whole`` are values
-    of all muscles by model.
-    """
-    first, *others = whole
-    depth = whole[first].get(DEEPER, 0.0)
-    verb = "keeps out of" if depth <= from_mm(KEPT_OUT, units) else "enters"
-    there = [
-        f"{labels[name]}: {shown_number(whole[name].get(DEEPER, 0.0), units)}" for name in others
-    ]
-    texts = [
-        f"{labels[first]} {verb} bones: {shown_number(depth, units)} deep at most beyond "
-        "the overlap at rest" + (f" ({'; '.join(there)})" if there else "")
-    ]
-    before = whole[first].get("solver_penetration_max", 0.0)
-    if before > whole[first].get("penetration_max", 0.0) + from_mm(0.02, units):
-        texts.append(
-            f"Before it is clipped along bones its points are {shown_number(before, units)} deep"
-        )
-    return texts
-
-
-def _times_and_shapes(whole: Values, labels: dict[str, str], units: str) -> list[str]:
-    """The first model's time against the quickest other one, and which is nearest in shape."""
-    first, *others = whole
-    texts = []
-    timed = [
-        name for name in others if "time_frame" in whole[name] and "time_frame" in whole[first]
-    ]
-    quick = min(timed, key=lambda name: whole[name]["time_frame"], default=None)
-    if quick:
-        ratio = whole[first]["time_frame"] / whole[quick]["time_frame"]
-        name = f"{labels[quick]}{', the quickest of the others' if len(others) > 1 else ''}"
-        texts.append(f"{labels[first]} takes {ratio:.2g} times the time of {name}")
-    apart = {name: whole[name]["distance_rms"] for name in others if "distance_rms" in whole[name]}
-    if apart:
-        near = min(apart, key=apart.__getitem__)
-        away = f"{apart[near]:.2g} {units} RMS"
-        if len(others) == 1:
-            texts.append(f"The two surfaces are {away} apart")
-        else:
-            texts.append(f"Nearest to it in shape is {labels[near]} ({away})")
-            if near in timed and near != quick:
-                ratio = whole[near]["time_frame"] / whole[first]["time_frame"]
-                texts[-1] += f", which takes {ratio:.2g} times the time of {labels[first]}"
-    return texts
 
 
 LIGHTS = (DEEPER, "volume_error", "bowing", "return_rms", "time_frame")
@@ -715,7 +615,7 @@ def write_page(folder: Path, found: Comparison, *, pictures: bool = True) -> Non
                 "worst of muscles and frames, best in green",
                 table=_measures(found),
             ),
-            Section("Mean and standard deviation over the frames", table=_statistics(found)),
+            Section("Mean and standard deviation over the frames", table=_statistics(runs)),
             Section(
                 "What each model solves for",
                 table=Table(["", *(found.labels[name] for name in models)], rows),
@@ -743,10 +643,10 @@ def _light(found: Comparison, quantity: str, limit: float | None) -> CheckRow:
 
 def shown(found: Comparison, quantity: str, value: float | None) -> str:
     """A value of a measure with its unit; lengths that do not count as zero."""
-    measure, unit = MEASURES[quantity], found.measures[quantity].unit
-    if value is not None and unit == "mm" and abs(value) < 0.5 * measure.floor:
+    measure = found.measures[quantity]
+    if value is not None and measure.unit == "mm" and abs(value) < 0.5 * measure.floor:
         value = 0.0
-    return shown_number(value, unit)
+    return shown_number(value, measure.unit)
 
 
 def _measures(found: Comparison) -> Table:
@@ -762,23 +662,22 @@ def _measures(found: Comparison) -> Table:
     return Table(["", "against", *(found.labels[name] for name in found.models)], rows)
 
 
-def _statistics(found: Comparison) -> Table:
-    """Length, moment arms, volume and time of each muscle, mean ± standard deviation."""
-    models, rows = found.models, []
-    first = found.statistics[models[0]]
-    for muscle, quantities in first.items():
-        names = ["length", *(name for name in quantities if name.startswith("moment_arm:"))]
-        for name in [*names, "volume_error", "time_frame"]:
+def _statistics(runs: Mapping[str, RunData]) -> Table:
+    """Length, moment arms and volume of each muscle, mean ± standard deviation."""
+    first, rows = next(iter(runs.values())), []
+    for muscle, quantities in first.summary.items():
+        for name in quantities:
             quantity, about = split_name(name)
-            unit = unit_text(QUANTITIES[quantity][0], found.units)
+            if quantity not in _STATISTICS_SHOWN:
+                continue
             texts = []
-            for model in models:
-                spread = found.statistics[model].get(muscle, {}).get(name)
-                pair = [shown_number(x, unit) for x in (spread.mean, spread.sd)] if spread else []
-                texts.append(" ± ".join(pair) or "–")
+            for run in runs.values():
+                facts = run.summary.get(muscle, {}).get(name, QuantityFacts())
+                known = [facts["mean"], facts["sd"]] if "sd" in facts else []
+                texts.append(" ± ".join(shown_number(x, facts["unit"]) for x in known) or "–")
             title = f"{quantity.replace('_', ' ')} {about}".strip()
             rows.append([Cell(muscle), Cell(title), *map(Cell, texts)])
-    return Table(["", "", *(found.labels[name] for name in models)], rows)
+    return Table(["", "", *runs], rows)
 
 
 def _plots(runs: Mapping[str, RunData]) -> list[str]:
@@ -793,7 +692,7 @@ def _plots(runs: Mapping[str, RunData]) -> list[str]:
         for about in moment_arm_coordinates(first, muscle)
     ]
     shapes = {"length": ("Length", first.units)} | {
-        name: (MEASURES[name].title.capitalize(), "" if MEASURES[name].kind == "1" else first.units)
+        name: (MEASURES[name].title.capitalize(), "" if MEASURES[name].unit == "1" else first.units)
         for name in _DRAWN
     }
     for quantity, (title, unit) in shapes.items():
