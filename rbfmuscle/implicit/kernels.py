@@ -17,7 +17,6 @@ formula r^2 (r^a - 1) was not checked against the original of 2019, and neither 
 exponent.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -207,15 +206,11 @@ class Kernel:
 
     def phi(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
         """Kernel at distances r (any shape), shape parameter epsilon [1/length]."""
-        return self._at_distance(r, epsilon, 0)
-
-    def first(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
-        """phi'(r)/r, with its limit at r = 0 (which is infinite for kernels that are not C2)."""
-        return self._at_distance(r, epsilon, 1)
-
-    def second(self, r: ArrayLike, epsilon: float = 1.0) -> Floats:
-        """(phi'' - phi'/r)/r**2, with its limit at r = 0 (infinite for kernels that are not C4)."""
-        return self._at_distance(r, epsilon, 2)
+        r = np.asarray(r, dtype=float)
+        check_finite(np.atleast_1d(r), name="r")
+        s = np.atleast_1d(r * epsilon)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self.radial(s * s, 1)[0].reshape(r.shape)
 
     def radial(self, u: Floats, count: int) -> list[Floats]:
         """The first ``count`` radial functions at u = s**2, of any shape.
@@ -242,35 +237,6 @@ class Kernel:
         if np.isfinite(self.limits[k]):
             values[s == 0.0] = self.limits[k]
         return values
-
-    def _at_distance(self, r: ArrayLike, epsilon: float, k: int) -> Floats:
-        r = np.asarray(r, dtype=float)
-        check_finite(np.atleast_1d(r), name="r")
-        s = np.abs(r) * epsilon
-        if self.functions and k >= len(self.functions):
-            return np.full(s.shape, np.nan)
-        with np.errstate(over="ignore", invalid="ignore"):
-            values = self.radial(np.atleast_1d(s * s), k + 1)[k].reshape(r.shape)
-        values = np.where(s == 0.0, self._limit(k), values)
-        return np.asarray(values * epsilon ** (2 * k))
-
-    def _limit(self, k: int) -> float:
-        """Value of the k-th radial function at s = 0."""
-        if self.functions:
-            return self.limits[k]
-        power = self.table[k, 0]
-        inner = self.table[k, 2 : 2 + TERMS]
-        outer = self.table[k, 2 + TERMS :]
-        limit = outer[0]
-        if self.base == LOG:
-            limit = -math.inf * inner[0] if inner[0] else limit
-        elif self.base == POWER:
-            power, limit = (power + self.parameter, inner[0]) if not limit else (power, limit)
-        else:
-            limit += inner[0]
-        if power > 0:
-            return 0.0
-        return limit if power == 0 or limit == 0 else math.copysign(math.inf, limit)
 
 
 Phi = tuple[int, tuple[float | Fraction, ...], tuple[float | Fraction, ...], int]
