@@ -66,26 +66,25 @@ def compare(
             pictures=pictures,
             progress=advance,
         )
-    error = _excess(table.models, output, limits)
+    error = None
+    if texts := list(_failures(table.models, output, limits)):
+        error = LimitExceededError("; ".join(texts))
     if table.failed:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in table.failed.items())
         error = SolveError(f"{reasons}; the other models are in {output}")
     return print_result(work, table.model_dump(), _table_lines(table, output), error=error)
 
 
-def _excess(models, output, limits):
-    """The error that a run is beyond a limit of ``--fail-on``; None where none is."""
+def _failures(models, output, limits):
+    """What each run is beyond a limit of ``--fail-on``, in words."""
     from rbfmuscle.metrics.summary import Summary
-    from rbfmuscle.metrics.verdict import require_limits
+    from rbfmuscle.metrics.verdict import describe_failures
     from rbfmuscle.run.data import RunData
 
-    texts = []
     for name in models if limits.fail_on else ():
-        try:
-            require_limits(Summary(RunData.load(output / name).metrics).table(), limits)
-        except LimitExceededError as error:
-            texts.append(f"{name}: {error}")
-    return LimitExceededError("; ".join(texts)) if texts else None
+        table = Summary(RunData.load(output / name).metrics).table()
+        for text in describe_failures(table, limits):
+            yield f"{name}: {text}"
 
 
 def _table_lines(table, output):

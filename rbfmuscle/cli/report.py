@@ -26,49 +26,35 @@ from rbfmuscle.validation import (
 
 MOST = 3  # values beyond limits that are named
 WIDTH = 80  # characters of a line
-LONGEST = 140  # characters about what was not measured or is doubtful: two lines
+LONGEST = 140  # characters of a text: two lines
 
 
 def verdict_lines(directory: Path) -> Iterator[str]:
-    """Lines about a run in a folder, at most `WIDTH` characters each where no name is longer."""
-    from rbfmuscle.metrics.quantities import quantity_of
-    from rbfmuscle.metrics.summary import LIMITS, LOOK, Summary
-    from rbfmuscle.metrics.verdict import (
-        describe_doubts,
-        describe_excess,
-        describe_unmeasured,
-        find_remedy,
-        worst_first,
-    )
+    """Lines about a run in a folder, at most `WIDTH` characters each where no name is longer; what
+    to do is not wrapped, so that commands can be copied.
+    """
+    from rbfmuscle.metrics.summary import Summary
+    from rbfmuscle.metrics.verdict import REMEDIES, Verdict, verdict_parts
     from rbfmuscle.run.data import RunData
     from rbfmuscle.scene.phantom import PHANTOM
 
     saved = RunData.load(directory)
-    info = saved.info
-    table = Summary(saved.metrics).table()
-    yield _wrapped("verdict: ", info.outcome)
-    named = worst_first(info.beyond)[:MOST]
-    for row in named:
-        yield _wrapped("  ", describe_excess(row, table, info.scene.missing_bones))
-    if len(info.beyond) > len(named):
-        yield f"  and {len(info.beyond) - len(named)} more values beyond their limits"
-    missing = info.not_measured
-    if missing:
-        yield _wrapped("not measured: ", shorten(describe_unmeasured(missing), LONGEST))
-    if info.doubts:
-        yield _wrapped("doubtful: ", shorten(describe_doubts(info.doubts, MOST), LONGEST))
-    known = [row for row in named if quantity_of(row.quantity) in LIMITS]
-    remedies = dict.fromkeys(find_remedy(row, table) for row in known)
-    remedies.pop(LOOK, None)  # said below, for all of them
-    for remedy in remedies:
-        yield _wrapped("what to do: ", remedy.replace("SCENE", info.scene.file or PHANTOM))
-    if named and saved.has_surfaces and named[0].frame is not None:
-        frame = named[0].frame
-        yield f"where to look: rbfmuscle render {directory} --frame {frame} -o frame.png"
+    info, table = saved.info, Summary(saved.metrics).table()
+    verdict = Verdict(info.outcome, info.beyond, info.not_measured, info.doubts)
+    yield _wrapped(f"verdict: {info.outcome}")
+    parts = verdict_parts(verdict, table, info.scene.missing_bones, values=MOST)
+    for head, texts in parts.items():
+        yield f"{head.lower()}:"
+        for text in texts:
+            if head == REMEDIES:
+                text = text.replace("render RUN", f"render {directory}")
+                yield f"  {text.replace('check SCENE', f'check {info.scene.file or PHANTOM}')}"
+            else:
+                yield _wrapped(f"  {shorten(text, LONGEST)}")
 
 
-def _wrapped(head: str, text: str) -> str:
-    return fill(head + text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)
+def _wrapped(text: str) -> str:
+    return fill(text, WIDTH, subsequent_indent="    ", break_on_hyphens=False)
 
 
 def report(

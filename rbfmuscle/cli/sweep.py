@@ -95,8 +95,8 @@ def sweep(
     failed: RBFMuscleError | None = None
     if bad:
         failed = SolveError(f"{len(bad)} of {len(table.rows)} points failed; {remedy}")
-    elif beyond := list(_beyond(table, output, limits)):
-        failed = LimitExceededError("; ".join(beyond[:5]))
+    elif texts := list(_failures(table, output, limits)):
+        failed = LimitExceededError("; ".join(texts[:5]))
     lines = [
         *(verdict.text for verdict in table.verdicts),
         f"{table.done} points done, {table.failed} failed, in {output}, open {output}/sweep.html",
@@ -104,21 +104,12 @@ def sweep(
     return print_result(printing, table.model_dump(), lines, error=failed)
 
 
-def _beyond(table, output, limits):
-    """What the points hold beyond the limits of their scenes, and what they did not measure, in
-    words.
-    """
-    from rbfmuscle.metrics.summary import exceeded, shown_number, unmeasured
+def _failures(table, output, limits):
+    """What each point is beyond a limit of ``--fail-on`` of its scene, in words."""
+    from rbfmuscle.metrics.verdict import describe_failures
     from rbfmuscle.studies.sweep import SweepFolder
 
     folder = SweepFolder(output)
     for row in table.rows:
-        facts, held = folder.read(row.key).get("summary", {}), limits[row.scene].failing()
-        for found in exceeded(facts, held):
-            value = shown_number(found.value)
-            yield (
-                f"{row.scene} {row.label}: {found.muscle}, {found.quantity} {value} (limit "
-                f"{shown_number(found.limit)})"
-            )
-        for lacking in unmeasured(facts, held):
-            yield f"{row.scene} {row.label}: {lacking.quantity} was not measured"
+        for text in describe_failures(folder.read(row.key).get("summary", {}), limits[row.scene]):
+            yield f"{row.scene} {row.label}: {text}"

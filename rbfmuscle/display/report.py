@@ -41,12 +41,12 @@ from rbfmuscle.metrics.summary import (
 from rbfmuscle.metrics.verdict import (
     MOVED,
     Verdict,
-    describe_details,
     describe_unmeasured,
     describe_verdict,
     judge,
     published_band,
     require_limits,
+    verdict_parts,
 )
 from rbfmuscle.run.data import RunData, moment_arm_coordinates
 from rbfmuscle.run.info import RunInfo
@@ -149,11 +149,11 @@ def packed_scene(runs: Mapping[str, RunData]) -> str:
 def _page(saved: RunData) -> ReportPage:
     info = saved.info
     complete = info.status == "complete"
-    answer, details = info.outcome, []
+    answer, parts = info.outcome, {}
     if complete:
         verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
         table = Summary(saved.metrics).table()  # with what is measured of the bones
-        details = describe_details(verdict, table, info.scene.missing_bones, MOST_DOUBTS)
+        parts = verdict_parts(verdict, table, info.scene.missing_bones, doubts=MOST_DOUBTS)
     else:
         answer = f"the run ended early ({info.status}): {info.message or ''}"
     return ReportPage(
@@ -161,7 +161,9 @@ def _page(saved: RunData) -> ReportPage:
         _facts(saved),
         f"{answer[:1].upper()}{answer[1:].rstrip('.')}.",
         GOOD if complete and not (info.beyond or info.not_measured) else BAD,
-        detail=" ".join(f"{text.rstrip('.')}." for text in details),
+        detail=" ".join(
+            f"{head}: {'; '.join(texts).rstrip('.')}." for head, texts in parts.items()
+        ),
         lights=_lights(saved),
         sections=[
             *_plots(saved),

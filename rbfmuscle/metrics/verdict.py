@@ -32,6 +32,7 @@ from rbfmuscle.scene.scene import Scene
 from rbfmuscle.validation import LimitExceededError, listed
 
 MOST_NAMED = 6  # exceeded limits that a verdict names
+REMEDIES = "What to do"  # head of that part of a verdict
 
 
 class Verdict(NamedTuple):
@@ -74,43 +75,52 @@ def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -
 
 
 def describe_verdict(verdict: Verdict, table: Table, missing_bones: Sequence[str] = ()) -> str:
-    """A verdict in sentences: its outcome, the worst of what is beyond a limit, what to do, what
-    was not measured, and the first of what is doubtful; bones ``missing_bones``.
+    """A verdict in sentences: its outcome, then `verdict_parts`."""
+    parts = verdict_parts(verdict, table, missing_bones)
+    return ". ".join(
+        [verdict.outcome, *(f"{head}: {'; '.join(texts)}" for head, texts in parts.items())]
+    )
+
+
+def verdict_parts(
+    verdict: Verdict,
+    table: Table,
+    missing_bones: Sequence[str],
+    *,
+    values: int = MOST_NAMED,
+    doubts: int = 1,
+) -> dict[str, list[str]]:
+    """What follows the outcome of a verdict, by its head: the worst of what is beyond a limit, so
+    many ``values``, what to do (`REMEDIES`), what was not measured, and the first ``doubts``; bones
+    ``missing_bones``.
     """
-    return ". ".join([verdict.outcome, *describe_details(verdict, table, missing_bones, 1)])
-
-
-def describe_details(
-    verdict: Verdict, table: Table, missing_bones: Sequence[str], most_doubts: int
-) -> list[str]:
-    """The sentences of a verdict after its outcome."""
-    texts = []
-    named = worst_first(verdict.beyond)[:MOST_NAMED]
+    parts: dict[str, list[str]] = {}
+    named = worst_first(verdict.beyond)[:values]
     if named:
-        values = "; ".join(describe_excess(row, table, missing_bones) for row in named)
+        texts = [describe_excess(row, table, missing_bones) for row in named]
         left = len(verdict.beyond) - len(named)
-        texts.append(f"Worst: {values}" + (f" and {left} more" if left else ""))
+        parts["Worst"] = [*texts, f"and {left} more"] if left else texts
     remedies: dict[str, str] = {}
     for row in named:
         if quantity_of(row.quantity) in LIMITS:
             remedy = find_remedy(row, table)
             remedies.setdefault(remedy, remedy.replace("FRAME", str(row.frame)))
     if remedies:
-        texts.append(f"What to do: {'; '.join(remedies.values())}")
+        parts[REMEDIES] = list(remedies.values())
     if verdict.not_measured and set(table) - {ALL}:
-        texts.append(f"Not measured: {describe_unmeasured(verdict.not_measured)}")
+        parts["Not measured"] = [describe_unmeasured(verdict.not_measured)]
     if verdict.doubts:
-        texts.append(f"Doubtful: {describe_doubts(verdict.doubts, most_doubts)}")
-    return texts
+        texts = describe_doubts(verdict.doubts[:doubts])
+        left = len(verdict.doubts) - len(texts)
+        parts["Doubtful"] = [*texts, f"and {left} more"] if left else texts
+    return parts
 
 
-def describe_doubts(doubts: Sequence[Doubt], most: int) -> str:
-    """The first of some doubts, and how many more there are."""
-    texts = [
+def describe_doubts(doubts: Sequence[Doubt]) -> list[str]:
+    """Doubts in words, each with its muscle."""
+    return [
         doubt.text if doubt.muscle == ALL else f"{doubt.muscle}: {doubt.text}" for doubt in doubts
     ]
-    more = [f"and {len(texts) - most} more"] if len(texts) > most else []
-    return "; ".join([*texts[:most], *more])
 
 
 def describe_unmeasured(missing: Sequence[tuple[str, str]]) -> str:
@@ -161,18 +171,20 @@ def describe_excess(row: Exceedance, table: Table, missing_bones: Sequence[str] 
     return f"{place}, {title} {value} at frame {frame} (limit {shown_limit})"
 
 
-def require_limits(table: Table, limits: Limits) -> None:
-    """Raise LimitExceededError naming everything beyond the limits of ``fail_on``, and those of
-    them that were not measured.
-    """
+def describe_failures(table: Table, limits: Limits) -> list[str]:
+    """Everything beyond the limits of ``fail_on``, and those of them that were not measured."""
     failing = limits.failing()
     texts = [
         f"{m}: {q} = {v:.4g} {'<' if q in LOWER_BOUNDS else '>'} {limit:g} at frame {f}"
         for m, q, v, limit, f in exceeded(table, failing)
     ]
     missing = unmeasured(table, failing)
-    texts += [f"not measured: {describe_unmeasured(missing)}"] if missing else []
-    if texts:
+    return [*texts, f"not measured: {describe_unmeasured(missing)}"] if missing else texts
+
+
+def require_limits(table: Table, limits: Limits) -> None:
+    """Raise LimitExceededError with `describe_failures`, if there are any."""
+    if texts := describe_failures(table, limits):
         raise LimitExceededError("; ".join(texts))
 
 

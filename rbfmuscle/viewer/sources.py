@@ -338,7 +338,7 @@ class SavedSource:
         self.muscles = {name: first.mesh(name, first.frame_numbers[0]) for name in first.muscles}
         self.colours, self.rest = first.colours, SavedFigure(first).advance()
         self.motion = [{"frame": float(frame)} for frame in first.frame_numbers]
-        self.marks = Marks([], [], [describe_doubts([doubt], 1) for doubt in first.info.doubts])
+        self.marks = Marks([], [], describe_doubts(first.info.doubts))
         self.controls = {
             "frame": Control("Run", "frame", *(first.frames[k].index for k in (0, -1, 0)))
         }

@@ -74,8 +74,10 @@ def test_verdict_of_many_muscles_fits_one_screen(folder, capsys):
     assert lines[0].startswith("verdict: 0 of 38 muscles are within all limits; ")
     assert sum("(limit " in line for line in lines) == 3
     beyond = len(info(folder)["beyond"])
-    assert beyond > 100 and f"  and {beyond - 3} more values beyond their limits" in lines
-    assert any(line.startswith("where to look: rbfmuscle render run --frame ") for line in lines)
+    assert beyond > 100 and f"  and {beyond - 3} more" in lines
+    assert any(
+        line.startswith("  look at that frame: rbfmuscle render run --frame ") for line in lines
+    )
     assert lines[-1] == "open run/report.html"
 
 
