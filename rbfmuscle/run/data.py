@@ -353,13 +353,23 @@ def frame_caption(run: RunData, number: int) -> str:
     return ", ".join([f"frame {number}", *clock, *texts])
 
 
-def as_table(columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Columns (n,) by name as a structured ndarray (n,)."""
-    count = len(next(iter(columns.values())))
-    table = np.empty(count, dtype=[(name, x.dtype) for name, x in columns.items()])
-    for name, values in columns.items():
+def as_table(columns: Mapping[str, Sequence[object] | np.ndarray]) -> np.ndarray:
+    """Columns (n,) by name as a structured ndarray (n,); None becomes NaN."""
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    for name, values in arrays.items():
+        if values.dtype == object:
+            arrays[name] = np.array([np.nan if value is None else value for value in values])
+    table = np.empty(
+        len(next(iter(arrays.values()))), dtype=[(name, x.dtype) for name, x in arrays.items()]
+    )
+    for name, values in arrays.items():
         table[name] = values
     return table
+
+
+def csv_rows(table: np.ndarray) -> list[Sequence[object]]:
+    """The rows of a structured ndarray, below the names of its columns."""
+    return [table.dtype.names or (), *table.tolist()]
 
 
 def named_coordinates(quantity: str, rows: Sequence[Row], coordinate: str | None) -> list[str]:

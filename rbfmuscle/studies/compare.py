@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
 from pathlib import Path
@@ -40,7 +40,7 @@ from rbfmuscle.models import (
 from rbfmuscle.progress import stage
 from rbfmuscle.recording import Run, stream_run
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
-from rbfmuscle.run.data import RunData, as_table, moment_arm_coordinates
+from rbfmuscle.run.data import RunData, as_table, csv_rows, moment_arm_coordinates
 from rbfmuscle.run.writer import machine, run_folder, versions, write_csv, write_json
 from rbfmuscle.scene.frames import pick_frames
 from rbfmuscle.scene.objects import from_mm
@@ -287,8 +287,6 @@ STATISTICS = (*FROM_METRICS, "length", "moment_arm")
 _STATISTICS_SHOWN = ("length", "moment_arm", "volume_error")
 
 
-VALUE_COLUMNS = ("model", "muscle", "quantity", "value", "unit", "against")
-
 # Values by muscle, "all" included, and quantity.
 Values = dict[str, dict[str, float]]
 
@@ -323,8 +321,15 @@ class Comparison(BaseModel, Study):
 
     def table(self) -> np.ndarray:
         """Every value as a structured ndarray, with the columns of ``comparison.csv``."""
-        columns = zip(VALUE_COLUMNS, zip(*self.value_rows()))
-        return as_table({name: np.array(values) for name, values in columns})
+        rows = [
+            (model, muscle, name, values[name], measure.unit, measure.against)
+            for model, muscles in self.results.items()
+            for muscle, values in muscles.items()
+            for name, measure in self.measures.items()
+            if name in values
+        ]
+        names = ("model", "muscle", "quantity", "value", "unit", "against")
+        return as_table(dict(zip(names, zip(*rows))))
 
     def save(self, directory: str | Path) -> None:
         """Write what the command writes, the run of each model among it.
@@ -336,14 +341,6 @@ class Comparison(BaseModel, Study):
         super().save(directory)
         for name in self.models:
             Run.load(self._folder / name).save(Path(directory) / name)
-
-    def value_rows(self) -> Iterator[tuple[str, str, str, float, str, str]]:
-        """Every value, in rows of `VALUE_COLUMNS`."""
-        for model, muscles in self.results.items():
-            for muscle, values in muscles.items():
-                for name, measure in self.measures.items():
-                    if name in values:
-                        yield model, muscle, name, values[name], measure.unit, measure.against
 
 
 FORMAT = 5  # of comparison.json
@@ -468,7 +465,7 @@ def write_tables(
         versions=versions(),
     )
     write_json(folder / "comparison.json", table.model_dump())
-    write_csv(folder / "comparison.csv", [VALUE_COLUMNS, *table.value_rows()])
+    write_csv(folder / "comparison.csv", csv_rows(table.table()))
     rows: list[tuple[object, ...]] = [("model", "muscle", "quantity", "mean", "sd", "unit")]
     rows += [
         (model, muscle, name, facts["mean"], facts["sd"], facts["unit"])

@@ -53,7 +53,7 @@ from rbfmuscle.implicit.selection import BOUND, SCAN, SPAN, choose_epsilon, spac
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.progress import stage
 from rbfmuscle.run.appearance import MUSCLE_COLOURS
-from rbfmuscle.run.data import as_table
+from rbfmuscle.run.data import as_table, csv_rows
 from rbfmuscle.run.writer import json_text, versions, write_csv
 from rbfmuscle.scene.meshes.read import read_mesh
 from rbfmuscle.scene.phantom import PHANTOM, open_scene
@@ -142,8 +142,7 @@ def study_kernels(
             study.rows += [one.row for one in found]
             study.surfaces += [one.surface for one in found]
         with kernels_folder(folder).staged() as staged:
-            table = [[getattr(row, name) for name in CSV_COLUMNS] for row in study.rows]
-            write_csv(staged / "kernels.csv", [CSV_COLUMNS, *table])
+            write_csv(staged / "kernels.csv", csv_rows(study.table()))
             text = json_text(study.model_dump())
             (staged / "kernels.json").write_text(text, encoding="utf-8")
             write_page(staged, study)
@@ -236,10 +235,6 @@ class KernelRow(BaseModel):
         if self.bound:
             lines.append(f"condition = {self.bound:g}")
         return "\n".join(lines)
-
-
-# Columns of ``kernels.csv``.
-CSV_COLUMNS = [name for name in KernelRow.model_fields if name != "trials"]
 
 
 def at_end(shape: float) -> bool:
@@ -485,13 +480,8 @@ class KernelStudy(BaseModel, Study):
 
     def table(self) -> np.ndarray:
         """The rows as a structured ndarray, with the columns of ``kernels.csv``."""
-        columns = {name: [getattr(row, name) for row in self.rows] for name in CSV_COLUMNS}
-        return as_table(
-            {
-                name: np.array([np.nan if value is None else value for value in values])
-                for name, values in columns.items()
-            }
-        )
+        names = [name for name in KernelRow.model_fields if name != "trials"]
+        return as_table({name: [getattr(row, name) for row in self.rows] for name in names})
 
     def answer(self) -> str:
         """What to use and why: of one surface its own sentence, of several the kernel that is near

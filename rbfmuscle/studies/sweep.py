@@ -11,7 +11,7 @@ import os
 import platform
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +40,7 @@ from rbfmuscle.metrics.quantities import ALL, QUANTITIES
 from rbfmuscle.metrics.summary import QuantityFacts, shown_number
 from rbfmuscle.models import configure_scene
 from rbfmuscle.recording import Run, simulate
-from rbfmuscle.run.data import RunData, as_table
+from rbfmuscle.run.data import RunData, as_table, csv_rows
 from rbfmuscle.run.writer import versions, write_csv, write_json
 from rbfmuscle.scene.content import content_hash
 from rbfmuscle.scene.phantom import open_scene
@@ -306,14 +306,19 @@ class SweepTable(BaseModel, Study):
     rows: list[SweepRow]
 
     def table(self) -> np.ndarray:
-        """The points as a structured ndarray: settings (as text), then facts and values."""
+        """The points as a structured ndarray, with the columns of ``sweep.csv``: settings
+        (as text), then facts and values.
+        """
         keys = list(dict.fromkeys(key for row in self.rows for key in row.settings))
-        facts = ("scene", "role", "status", "front")
-        return as_table(
-            {key: np.array([str(row.settings.get(key, "")) for row in self.rows]) for key in keys}
-            | {name: np.array([getattr(row, name) for row in self.rows]) for name in facts}
-            | {name: np.array([row.value(name) for row in self.rows]) for name in VALUES}
-        )
+        first = ("scene", "units", "role", "status", "front")
+        last = ("seconds", "threads", "machine", "message", "reference", "key")
+        columns: dict[str, list[object]] = {
+            key: [str(row.settings.get(key, "")) for row in self.rows] for key in keys
+        }
+        columns |= {name: [getattr(row, name) for row in self.rows] for name in first}
+        columns |= {name: [row.value(name) for row in self.rows] for name in VALUES}
+        columns |= {name: [getattr(row, name) for row in self.rows] for name in last}
+        return as_table(columns)
 
 
 # Worst over muscles and frames, by magnitude: of a point of a sweep, and of the README's table.
@@ -702,7 +707,6 @@ def write_table(
     folder = SweepFolder(directory)
     rows = sweep_rows(points, folder, units)
     verdicts = mark_front(rows, quantity)
-    write_csv(folder.directory / "sweep.csv", _lines(rows))
     statuses = [row.status for row in rows]
     table = SweepTable(
         quantity=quantity,
@@ -713,22 +717,13 @@ def write_table(
         rows=rows,
     )
     write_json(folder.directory / "sweep.json", table.model_dump())
+    # Digits beyond nine places are rounding.
+    lines = [
+        [f"{round(cell, 9):.6g}" if isinstance(cell, float) else cell for cell in row]
+        for row in csv_rows(table.table())
+    ]
+    write_csv(folder.directory / "sweep.csv", lines)
     return table
-
-
-def _lines(rows: Sequence[SweepRow]) -> Iterator[list[object]]:
-    """Lines of ``sweep.csv``: settings, then facts and values of each point."""
-    keys = list(dict.fromkeys(key for row in rows for key in row.settings))
-    first = ("scene", "units", "role", "status", "front")
-    last = ("seconds", "threads", "machine", "message", "reference", "key")
-    yield [*keys, *first, *VALUES, *last]
-    for row in rows:
-        cells = [row.settings.get(key, "") for key in keys]
-        cells += [getattr(row, name) for name in first]
-        cells += [row.value(name) for name in VALUES]
-        cells += ["" if getattr(row, name) is None else getattr(row, name) for name in last]
-        # Digits beyond nine places are rounding.
-        yield [f"{round(v, 9):.6g}" if isinstance(v, float) else v for v in cells]
 
 
 ROUNDING = 1e-9  # errors below it are none

@@ -199,6 +199,9 @@ def test_what_a_study_returns_is_a_table_that_is_saved_and_shown(
     assert len(table) and set(table.dtype.names) & {"value", "error_rms", "rms"}
     found.save(tmp_path / "out")
     found.save(tmp_path / "out")  # an earlier result is replaced
+    names = {"compare": "comparison.csv", "sweep": "sweep.csv", "kernels": "kernels.csv"}
+    lines = (tmp_path / "out" / names[found.command]).read_text(encoding="utf-8").splitlines()
+    assert lines[0].split(",") == list(table.dtype.names) and len(lines) == len(table) + 1
     page = tmp_path / "out" / found.page
     opened = []
     monkeypatch.setattr("webbrowser.open", opened.append)
