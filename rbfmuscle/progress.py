@@ -10,6 +10,8 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, ClassVar
 
+from rbfmuscle import interruption
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
@@ -20,14 +22,17 @@ class Progress:
     """Context manager; call it with (done, total). A nested one is shown under the title of the
     outer one.
 
-    ``title`` is that of the command or scene, ``what`` is what is counted.
+    ``title`` is that of the command or scene, ``what`` is what is counted, ``done`` the last count;
+    ``estimate``: a bar shows the time that is left, by that of what is counted.
     """
 
     shown: ClassVar[Progress | None] = None
     quiet: ClassVar[bool] = False  # nothing is shown
 
-    def __init__(self, title: str, what: str = "frame") -> None:
+    def __init__(self, title: str, what: str = "frame", *, estimate: bool = False) -> None:
         self.title, self.what = title, what
+        self.estimate = estimate
+        self.done = 0
         self.bar: Bar | None = None
         self.begun = time.monotonic()
         self.last = self.begun - EVERY + FIRST
@@ -37,20 +42,28 @@ class Progress:
             Progress.shown = self
             if sys.stderr.isatty() and not Progress.quiet:
                 from rich.console import Console
-                from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+                from rich.progress import (
+                    BarColumn,
+                    TextColumn,
+                    TimeElapsedColumn,
+                    TimeRemainingColumn,
+                )
                 from rich.progress import Progress as Bar
 
-                columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+                columns = [TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()]
+                columns += [TextColumn("to go"), TimeRemainingColumn()] if self.estimate else []
                 self.bar = Bar(*columns, console=Console(stderr=True), transient=True)
                 self.bar.start()
                 self.bar.add_task(self.title, total=None)
         return self
 
     def __call__(self, done: int, total: int) -> None:
-        """Show the count."""
+        """Show the count; an interrupt that was lost since the last one is raised again."""
+        self.done = done
         shown = Progress.shown or self
         if shown.bar is not None or done == total or time.monotonic() - shown.last > EVERY:
             shown.show(f"{self.what} {done} of {total}", done, total)
+        interruption.check()
 
     def show(self, text: str, done: int = 0, total: int | None = None) -> None:
         """Show a text, and a count."""

@@ -51,11 +51,6 @@ def compare(
         Progress("compare") as progress,
         interruption.keeping(lambda: kept if output.exists() else ""),
     ):
-
-        def advance(done, total):
-            progress(done, total)
-            interruption.check()
-
         table = run_models(
             opened,
             output,
@@ -64,7 +59,7 @@ def compare(
             frames=frames,
             jobs=work.jobs,
             pictures=pictures,
-            progress=advance,
+            progress=progress,
         )
     error = None
     if texts := list(_failures(table.models, output, limits)):

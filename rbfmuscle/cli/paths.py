@@ -2,7 +2,6 @@
 
 import math
 import re
-import time
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
@@ -72,35 +71,26 @@ def paths(
     spans, targets = parse_ranges(loaded, ranges), parse_targets(loaded, names or [])
     paths_folder(output)
     sampled: list[Samples] = []
-    done, begun, said = 0, time.monotonic(), ""
-
-    def advance(count, total):
-        nonlocal done, begun
-        done = count
-        if count == 1:  # before it models were built
-            begun = time.monotonic()
-        elif count in (2, 10):
-            left = (time.monotonic() - begun) / (count - 1) * (total - count)
-            progress.show(f"pose {count} of {total}, about {left:.0f} s to go", count, total)
-        progress(count, total)
-        interruption.check()
+    progress, said = Progress(loaded.name, "pose", estimate=True), ""
 
     def kept():
-        return said or (f"paths from {done} poses are in {output}" if done >= FEWEST else "")
+        return said or (
+            f"paths from {progress.done} poses are in {output}" if progress.done >= FEWEST else ""
+        )
 
     with interruption.keeping(kept):
         try:
-            with Progress(loaded.name, "pose") as progress, work.threads():
+            with progress, work.threads():
                 sample_muscles(
-                    loaded, spans, samples=samples, fibres=fibres, progress=advance, found=sampled
+                    loaded, spans, samples=samples, fibres=fibres, progress=progress, found=sampled
                 )
         except KeyboardInterrupt:
-            said = f"{done} poses are too few to fit anything"
+            said = f"{progress.done} poses are too few to fit anything"
             if usable := [found for found in sampled if fittable(found)]:
                 rows, _ = report_fits(loaded, usable, output, targets=targets)
                 worst = max(row["arm_rms"] for row in rows)
                 said = (
-                    f"paths from {done} poses are in {output}, "
+                    f"paths from {progress.done} poses are in {output}, "
                     f"moment arms wrong by up to {worst:.3g} {loaded.units} RMS"
                 )
             raise

@@ -66,19 +66,13 @@ def run(
     """Run a scene through its motion and write surfaces, metrics and a report."""
     from rbfmuscle import interruption
 
-    start, done = time.perf_counter(), 0
+    start, progress = time.perf_counter(), Progress(scene.stem)
 
     def kept():
-        return f"{done} frames are kept in {output}" if done else ""
-
-    def advance(count, total):
-        nonlocal done
-        done = count
-        progress(count, total)
-        interruption.check()
+        return f"{progress.done} frames are kept in {output}" if progress.done else ""
 
     failed: RBFMuscleError | None = None
-    with Progress(scene.stem) as progress, interruption.keeping(kept), work.threads():
+    with progress, interruption.keeping(kept), work.threads():
         from rbfmuscle.recording import stream_run
         from rbfmuscle.run.data import RunData
         from rbfmuscle.scene.phantom import open_scene
@@ -94,11 +88,11 @@ def run(
                 settings=changes,
                 frames=frames,
                 fail_on=fail_on,
-                progress=advance,
+                progress=progress,
             )
         except SolveError as error:
             failed = SolveError("; ".join(filter(None, [str(error), kept()])))
-            if not done:
+            if not progress.done:
                 raise failed from None
         except LimitExceededError as error:
             failed = error

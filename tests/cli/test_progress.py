@@ -2,7 +2,9 @@
 
 from types import SimpleNamespace
 
-from rbfmuscle import progress
+import pytest
+
+from rbfmuscle import interruption, progress
 from rbfmuscle.progress import Progress, stage
 
 
@@ -36,3 +38,21 @@ def test_a_terminal_has_a_bar_that_goes_when_it_is_done(monkeypatch, capsys):
         shown(1, 6)
     out, err = capsys.readouterr()
     assert out == "" and "arm: frame 1 of 6" in err and err.endswith("\x1b[2K")
+
+
+def test_the_time_that_is_left_is_shown_where_it_is_asked_for(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    for estimate in (False, True):
+        with Progress("arm", estimate=estimate) as shown:
+            shown(1, 6)
+        assert (" to go " in capsys.readouterr().err) == estimate
+
+
+def test_an_interrupt_that_was_lost_is_raised_at_the_next_count(monkeypatch):
+    with Progress("arm") as shown:
+        shown(1, 6)
+        monkeypatch.setattr(interruption._State, "asked", True)
+        with pytest.raises(KeyboardInterrupt):
+            shown(2, 6)
+    assert shown.done == 2
