@@ -30,10 +30,9 @@ from rbfmuscle.metrics.summary import (
     parse_limits,
 )
 from rbfmuscle.metrics.verdict import (
-    describe_verdict,
-    judge,
     measured_doubts,
     require_limits,
+    verdict_facts,
 )
 from rbfmuscle.models import build_models, configure_scene, kernel_names
 from rbfmuscle.progress import Progress, stage
@@ -460,11 +459,9 @@ class Recording:
         """The facts by now."""
         self.times["wall"] = (self._end or time.perf_counter()) - self._start
         table = self.summary.table()
-        verdict = judge(table, self.limits, self._doubts)
-        if self.status == "failed" and self.written:  # of how many frames the verdict holds
-            count = f"{len(self.written)} of {len(self.scene.motion)} frames"
-            outcome = f"the run stopped after {count}; in these {verdict.outcome}"
-            verdict = verdict._replace(outcome=outcome)
+        stopped = ""
+        if self.status == "failed" and self.written:
+            stopped = f"{len(self.written)} of {len(self.scene.motion)}"
         return build_info(
             self.scene,
             self.started,
@@ -479,10 +476,9 @@ class Recording:
                 if (epsilon := getattr(model, "epsilon", None)) is not None
             },
             times=self.times,
-            limits=self.limits.values,
-            fail_on=self.limits.fail_on,
-            verdict=describe_verdict(verdict, table, self.scene.missing_bones),
-            **verdict._asdict(),
+            **verdict_facts(
+                table, self.limits, self._doubts, self.scene.missing_bones, stopped=stopped
+            ),
             neighbours=self._measures.neighbours.table(),
             frames=self.written,
         )

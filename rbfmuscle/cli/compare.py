@@ -72,13 +72,11 @@ def compare(
 
 def _failures(models, output, limits):
     """What each run is beyond a limit of ``--fail-on``, in words."""
-    from rbfmuscle.metrics.summary import Summary
     from rbfmuscle.metrics.verdict import describe_failures
     from rbfmuscle.run.data import RunData
 
     for name in models if limits.fail_on else ():
-        table = Summary(RunData.load(output / name).metrics).table()
-        for text in describe_failures(table, limits):
+        for text in describe_failures(RunData.load(output / name).summarise(), limits):
             yield f"{name}: {text}"
 
 

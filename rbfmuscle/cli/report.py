@@ -8,7 +8,7 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from textwrap import fill, shorten
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
@@ -24,30 +24,30 @@ from rbfmuscle.validation import (
     UsageError,
 )
 
+if TYPE_CHECKING:
+    from rbfmuscle.run.data import RunData
+
 MOST = 3  # values beyond limits that are named
 WIDTH = 80  # characters of a line
 LONGEST = 140  # characters of a text: two lines
 
 
-def verdict_lines(directory: Path) -> Iterator[str]:
+def verdict_lines(saved: "RunData") -> Iterator[str]:
     """Lines about a run in a folder, at most `WIDTH` characters each where no name is longer; what
     to do is not wrapped, so that commands can be copied.
     """
-    from rbfmuscle.metrics.summary import Summary
     from rbfmuscle.metrics.verdict import REMEDIES, Verdict, verdict_parts
-    from rbfmuscle.run.data import RunData
     from rbfmuscle.scene.phantom import PHANTOM
 
-    saved = RunData.load(directory)
-    info, table = saved.info, Summary(saved.metrics).table()
+    info = saved.info
     verdict = Verdict(info.outcome, info.beyond, info.not_measured, info.doubts)
     yield _wrapped(f"verdict: {info.outcome}")
-    parts = verdict_parts(verdict, table, info.scene.missing_bones, values=MOST)
+    parts = verdict_parts(verdict, saved.summarise(), info.scene.missing_bones, values=MOST)
     for head, texts in parts.items():
         yield f"{head.lower()}:"
         for text in texts:
             if head == REMEDIES:
-                text = text.replace("render RUN", f"render {directory}")
+                text = text.replace("render RUN", f"render {saved.directory}")
                 yield f"  {text.replace('check SCENE', f'check {info.scene.file or PHANTOM}')}"
             else:
                 yield _wrapped(f"  {shorten(text, LONGEST)}")
@@ -73,9 +73,10 @@ def report(
     pictures
         Draw pictures and the animation.
     """
+    from rbfmuscle.run.data import RunData
+
     with Progress(f"report {directory}"), stage("drawing pictures" if pictures else "writing"):
         from rbfmuscle.display.report import redraw_run
-        from rbfmuscle.run.data import RunData
 
         failed, page = None, directory / "report.html"
         study = _redraw_study(directory, pictures=pictures)
@@ -90,7 +91,9 @@ def report(
                 facts, failed = RunData.load(directory).info.to_dict(), error
     said: Iterable[str] = ()
     if page.name == "report.html":
-        said = [str(facts["answer"])] if "answer" in facts else verdict_lines(directory)
+        said = (
+            [str(facts["answer"])] if "answer" in facts else verdict_lines(RunData.load(directory))
+        )
     return print_result(printing, facts, chain(said, [f"open {page}"]), error=failed)
 
 

@@ -96,10 +96,10 @@ def run(
                 raise failed from None
         except LimitExceededError as error:
             failed = error
-        info = RunData.load(output).info
-    facts = {"directory": str(output), **info.to_dict()}
+        saved = RunData.load(output)
+    facts = {"directory": str(output), **saved.info.to_dict()}
     seconds = time.perf_counter() - start
     report = output / "report.html"
     there = f"in {output}, open {report}" if report.exists() else f"in {output}"
-    last = f"{len(info.frames)} frames in {seconds:.1f} s, {there}"
-    return print_result(work, facts, chain(verdict_lines(output), [last]), error=failed)
+    last = f"{len(saved)} frames in {seconds:.1f} s, {there}"
+    return print_result(work, facts, chain(verdict_lines(saved), [last]), error=failed)

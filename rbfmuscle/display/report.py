@@ -30,8 +30,6 @@ from rbfmuscle.metrics.summary import (
     LOWER_BOUNDS,
     Limits,
     QuantityFacts,
-    Summary,
-    exceeded,
     limit_ratio,
     meets_limit,
     muscle_limit,
@@ -42,10 +40,9 @@ from rbfmuscle.metrics.verdict import (
     MOVED,
     Verdict,
     describe_unmeasured,
-    describe_verdict,
-    judge,
     published_band,
     require_limits,
+    verdict_facts,
     verdict_parts,
 )
 from rbfmuscle.run.data import RunData, moment_arm_coordinates
@@ -152,7 +149,7 @@ def _page(saved: RunData) -> ReportPage:
     answer, parts = info.outcome, {}
     if complete:
         verdict = Verdict(answer, info.beyond, info.not_measured, info.doubts)
-        table = Summary(saved.metrics).table()  # with what is measured of the bones
+        table = saved.summarise()
         parts = verdict_parts(verdict, table, info.scene.missing_bones, doubts=MOST_DOUBTS)
     else:
         answer = f"the run ended early ({info.status}): {info.message or ''}"
@@ -201,7 +198,7 @@ def _lights(saved: RunData) -> list[CheckRow]:
     known = {quantity for quantities in LIGHTS.values() for quantity in quantities}
     limits = Limits(saved.info.limits, saved.info.fail_on)
     missing = saved.info.not_measured
-    beyond = {quantity_of(row.quantity) for row in exceeded(saved.info.muscles, limits)}
+    beyond = {quantity_of(row.quantity) for row in saved.info.beyond}
     other = sorted((beyond | set(limits.fail_on)) - known)
     named = LIGHTS | {name: (name,) for name in other}
     rows = [_light(saved, limits, title, quantities) for title, quantities in named.items()]
@@ -422,10 +419,11 @@ def redraw_run(
     folder = run_folder(directory)
     texts = [name if value is None else f"{name}={value!r}" for name, value in info.fail_on.items()]
     limits = parse_limits(texts if fail_on is None else fail_on, Scene(units=saved.units))
-    table = Summary(saved.metrics).table()
-    verdict = judge(table, limits, info.doubts)
-    facts = {"limits": dict(limits.values), "fail_on": dict(limits.fail_on)} | verdict._asdict()
-    facts["verdict"] = describe_verdict(verdict, table, info.scene.missing_bones)
+    table = saved.summarise()
+    scene, stopped = info.scene, ""
+    if info.status == "failed" and info.frames:
+        stopped = f"{len(info.frames)} of {scene.motion.frames}"
+    facts = verdict_facts(table, limits, info.doubts, scene.missing_bones, stopped=stopped)
     info = info.model_copy(update=facts)
     drawn = pictures and saved.has_surfaces and len(saved.frames) > 1
     folder.add(*(PAGES if drawn else PAGES[:1]))

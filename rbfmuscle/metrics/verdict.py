@@ -74,6 +74,29 @@ def _outcome(table: Table, found: list[Exceedance], missing: list[Unmeasured]) -
     return f"{text}; the bones are not" if bones else text
 
 
+def verdict_facts(
+    table: Table,
+    limits: Limits,
+    doubts: Sequence[Doubt],
+    missing_bones: Sequence[str],
+    *,
+    stopped: str = "",
+) -> dict[str, object]:
+    """What ``run.json`` holds of the limits of a run and of its verdict; of one that failed,
+    ``stopped`` says how many frames that is of, as "3 of 5".
+    """
+    verdict = judge(table, limits, doubts)
+    if stopped:
+        outcome = f"the run stopped after {stopped} frames; in these {verdict.outcome}"
+        verdict = verdict._replace(outcome=outcome)
+    return {
+        "limits": dict(limits.values),
+        "fail_on": dict(limits.fail_on),
+        "verdict": describe_verdict(verdict, table, missing_bones),
+        **verdict._asdict(),
+    }
+
+
 def describe_verdict(verdict: Verdict, table: Table, missing_bones: Sequence[str] = ()) -> str:
     """A verdict in sentences: its outcome, then `verdict_parts`."""
     parts = verdict_parts(verdict, table, missing_bones)

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.metrics.quantities import ALL, Row
 from rbfmuscle.metrics.rows import ARM_REACH, moment_arms
+from rbfmuscle.metrics.summary import QuantityFacts, Summary
 from rbfmuscle.run import appearance as look
 from rbfmuscle.run.info import FORMAT, FrameInfo, RunInfo
 from rbfmuscle.run.vtk_files import frame_file, read_fibres, read_vtp
@@ -162,6 +163,10 @@ class RunData:
             lambda r: Row(int(r[0]), r[1], float(r[2]), r[3], r[4], float(r[5]), r[6]),
         )
         return cls(info, _read_frames(info, folder, poses), metrics, FolderMeshes(folder))
+
+    def summarise(self) -> dict[str, dict[str, QuantityFacts]]:
+        """`summary`, and under ``"all"`` what is measured of the bones and of whole frames."""
+        return Summary(self.metrics).table()
 
     def frame(self, number: int) -> Frame:
         """The frame of a number; of a negative one counted from the end."""

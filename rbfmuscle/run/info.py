@@ -145,9 +145,11 @@ class OutputInfo(Part):
 
 
 class MotionInfo(Part):
-    """The motion: ``times`` (n,) of its frames [s], where it has any; of how many frames it is
-    the ``whole``, those that ``--frames`` left out included.
+    """The motion: the number of its ``frames``, their ``times`` (n,) [s], where it has any; of how
+    many frames it is the ``whole``, those that ``--frames`` left out included.
     """
+
+    frames: int = 0
 
     times: list[float] | None = None
     whole: int | None = None  # None of earlier versions

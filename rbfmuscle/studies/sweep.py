@@ -628,7 +628,7 @@ def measure_point(
             elif point.reference:
                 values |= _errors(shown, folder.surfaces(point.reference))
             result["values"] = values
-            result["summary"] = run.summary
+            result["summary"] = run.summarise()
     except POINT_ERRORS as error:
         result["status"] = "failed"
         result["message"] = f"{type(error).__name__}: {' '.join(str(error).split())}"

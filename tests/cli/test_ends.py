@@ -284,6 +284,8 @@ def test_a_jump_of_the_bones_is_named_at_once_and_the_frames_before_it_are_kept(
     assert printed.startswith("verdict: the run stopped after 3 of 5 frames; in these")
     kept = Run.load(out)
     assert kept.info.status == "failed" and kept.frame_numbers == [0, 1, 2]
+    said = printed.splitlines()[0]
+    assert call(capsys, "report", out, "--no-pictures")[1].startswith(said)
     assert (out / "report.html").exists()
     code, printed, _ = call(capsys, "run", scene, "-o", tmp_path / "again", "--json")
     facts = json.loads(printed)

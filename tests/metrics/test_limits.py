@@ -269,7 +269,7 @@ def test_an_end_that_is_stated_to_lie_away_from_its_bone_is_a_doubt(monkeypatch,
     info = stream_run(scene, tmp_path, pictures=False)
     assert "end_gap" not in {row.quantity for row in info.beyond}
     said = ". Doubtful: biceps: an end lies"
-    lines = list(verdict_lines(tmp_path))
+    lines = list(verdict_lines(Run.load(tmp_path)))
     assert said in info.verdict
     assert lines[lines.index("doubtful:") + 1].startswith("  biceps: an end lies")
     # Frames are 10 degrees apart.
