@@ -546,11 +546,10 @@ def measure_fits(
     found.sort(
         key=lambda one: (bool(one.row.unfit), np.inf if one.row.rms is None else one.row.rms)
     )
-    rows = [one.row for one in found]
-    good = [row for row in rows if not row.unfit]
-    front = pareto_front([row.error for row in good], [row.cost for row in good])
-    for row in rows:  # no other row beats those of the front both in error and in time
-        row.front = any(row is good[index] for index in front)
+    good = [one.row for one in found if not one.row.unfit]
+    # No other row beats those of the front both in error and in time.
+    for k in pareto_front([row.error for row in good], [row.cost for row in good]):
+        good[k].front = True
     return found
 
 
