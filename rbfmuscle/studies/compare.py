@@ -548,7 +548,7 @@ def describe(results: dict[str, Values], labels: dict[str, str], beyond: Beyond)
     if len(results) > 1:
         best = [labels[name] for name, count in kept.items() if count == max(kept.values())]
         texts.append(
-            f"By the limits {' and '.join(best)} are equally good"
+            f"By the limits {' and '.join(best)} are equal"
             if len(best) > 1
             else f"By the limits {best[0]} is the best"
         )

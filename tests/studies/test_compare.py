@@ -186,7 +186,7 @@ def test_the_sentences_name_what_is_beyond_limits_and_the_best_and_the_quickest(
     )
     assert "The comparison does not show which shape is right" in text
     same = describe(found, labels, beyond | {"b": beyond["a"]})
-    assert "By the limits A and B are equally good" in same
+    assert "By the limits A and B are equal. " in same
     alone = describe({"a": found["a"]}, labels, {"a": beyond["a"]})
     assert alone.endswith("volume error (one), bowing (one).")
 
