@@ -18,13 +18,7 @@ from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.rest import PBDOptions, RestState, edge_stiffness
 from pbd_baseline.topology import Topology, colour, members_in_order
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.frames import (
-    divided,
-    dot,
-    quaternion_matrix,
-    rotate,
-    turned_quaternions,
-)
+from rbfmuscle.geometry.frames import rotate, row_of, turn_towards, turned_quaternions
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.surfaces import vertex_areas
 from rbfmuscle.loops import loop
@@ -83,63 +77,20 @@ def _rotation_loop(points, rings, rest, weights, quaternions):
                 pull = sign * (points[i, a] - points[j, a])
                 for b in range(3):
                     moment[a, b] += pull * rest[c, b]
+        # One-rings are nearly flat, so the moment has rank two and a polar decomposition is not
+        # defined; the rotation that these steps lead to is.
+        rows = row_of(moment, 0), row_of(moment, 1), row_of(moment, 2)
+        q = quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3]
         for _ in range(ROTATION_STEPS):
-            if _turn_towards(moment, quaternions[i]) < ROTATION_ERROR:
+            turned = turn_towards(rows, q)
+            square = 0.0
+            for k in range(4):
+                square += 4.0 * (turned[k] - q[k]) ** 2
+            q = turned
+            if square < ROTATION_ERROR:
                 break
-
-
-@loop
-def _turn_towards(moment, q):
-    """One Newton step of maximising tr(R^T A) over rotations R; return its squared angle.
-
-    With B = R^T A and S its symmetric part, the step solves (tr(S) 1 - S) omega = axial(B).
-    One-rings are nearly flat, so A has rank two and a polar decomposition is not defined; this
-    maximum is.
-    """
-    r = quaternion_matrix(q)
-    b = np.empty((3, 3))
-    for m in range(3):
-        for n in range(3):
-            b[m, n] = r[0][m] * moment[0, n] + r[1][m] * moment[1, n] + r[2][m] * moment[2, n]
-    trace = b[0, 0] + b[1, 1] + b[2, 2]
-    v = b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1]
-    size = abs(trace) + abs(v[0]) + abs(v[1]) + abs(v[2])
-    if size <= 0.0:
-        return 0.0
-    xx = trace - b[0, 0]
-    yy = trace - b[1, 1]
-    zz = trace - b[2, 2]
-    xy = -0.5 * (b[0, 1] + b[1, 0])
-    xz = -0.5 * (b[0, 2] + b[2, 0])
-    yz = -0.5 * (b[1, 2] + b[2, 1])
-    first, second = xx * yy - xy * xy, yy * zz - yz * yz
-    third, fourth = xy * yz - xz * yy, xy * xz - xx * yz
-    fifth = xz * yz - xy * zz
-    sixth = xx * zz - xz * xz
-    det = zz * first + xz * third + yz * fourth
-    if xx > 1e-6 * size and first > 1e-12 * size * size and det > 1e-18 * size * size * size:
-        adjugate = (second, fifth, third), (fifth, sixth, fourth), (third, fourth, first)
-        step = dot(adjugate[0], v), dot(adjugate[1], v), dot(adjugate[2], v)
-        step = divided(step, det)
-    else:
-        step = divided(v, size)
-    square = dot(step, step)
-    if square > 1.0:
-        step = divided(step, np.sqrt(square))
-    # q <- q (1, step / 2), normalised: right to third order, and the fixed point is unchanged.
-    x = 0.5 * step[0]
-    y = 0.5 * step[1]
-    z = 0.5 * step[2]
-    turned = (
-        q[0] - q[1] * x - q[2] * y - q[3] * z,
-        q[1] + q[0] * x + q[2] * z - q[3] * y,
-        q[2] + q[0] * y + q[3] * x - q[1] * z,
-        q[3] + q[0] * z + q[1] * y - q[2] * x,
-    )
-    length = np.sqrt(turned[0] ** 2 + turned[1] ** 2 + turned[2] ** 2 + turned[3] ** 2)
-    for k in range(4):
-        q[k] = turned[k] / length
-    return square
+        for k in range(4):
+            quaternions[i, k] = q[k]
 
 
 @loop

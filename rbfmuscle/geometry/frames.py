@@ -4,6 +4,7 @@ boxes, and coordinates of a rest mesh that stay the same wherever its scene lies
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.loops import loop
@@ -11,32 +12,9 @@ from rbfmuscle.loops import loop
 
 def turned_quaternions(quaternions: Floats, rotation: Floats) -> Floats:
     """Unit quaternions (n, 4), each followed by a rotation (3, 3)."""
-    w, x, y, z = matrix_quaternion(rotation)
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return np.ascontiguousarray(quaternions @ left.T)
-
-
-@loop
-def matrix_quaternion(m):
-    """Unit quaternion of a rotation matrix, as four numbers, from the greatest of them (Shepperd
-    1978).
-    """
-    trace, i = m[0, 0] + m[1, 1] + m[2, 2], 0
-    for k in range(1, 3):
-        if m[k, k] > m[i, i]:
-            i = k
-    j, k = (i + 1) % 3, (i + 2) % 3
-    q = np.empty(4)
-    if trace > m[i, i]:
-        q[0] = 1.0 + trace
-        q[1] = m[2, 1] - m[1, 2]
-        q[2] = m[0, 2] - m[2, 0]
-        q[3] = m[1, 0] - m[0, 1]
-    else:
-        q[0], q[1 + i] = m[k, j] - m[j, k], 1.0 + 2.0 * m[i, i] - trace
-        q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
-    length = np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
-    return q[0] / length, q[1] / length, q[2] / length, q[3] / length
+    before = Rotation.from_quat(np.roll(quaternions, -1, axis=1))  # SciPy has w last
+    turned = Rotation.from_matrix(rotation) * before
+    return np.roll(turned.as_quat(), 1, axis=1)
 
 
 @loop

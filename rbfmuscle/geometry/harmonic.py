@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 import scipy.sparse as sparse
 from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
 
 from rbfmuscle.geometry.arrays import Array, Floats, Integers
-from rbfmuscle.geometry.frames import cross, dot, matrix_quaternion, row_of
+from rbfmuscle.geometry.frames import cross, dot, row_of
 from rbfmuscle.geometry.surfaces import face_normals
 from rbfmuscle.loops import loop
 
@@ -95,10 +96,21 @@ def blended_motion(points: Floats, weights: Floats, motions: Floats) -> Floats:
     exponentiated, so a motion that all bones share moves every point rigidly, and a weight of one
     gives that bone's motion exactly.
     """
-    twists, out = np.empty((len(motions), 6)), np.empty((len(points), 3))
-    logarithm_loop(motions, twists)
-    exponential_loop(np.asarray(points, dtype=np.float64), weights @ twists, out)
+    out = np.empty((len(points), 3))
+    exponential_loop(np.asarray(points, dtype=np.float64), weights @ _twists(motions), out)
     return out
+
+
+def _twists(motions: Floats) -> Floats:
+    """Twists (b, 6), each omega and velocity, of rigid motions (b, 4, 4)."""
+    omega = Rotation.from_matrix(motions[:, :3, :3]).as_rotvec()
+    shift = motions[:, :3, 3]
+    # Of smaller angles the factor is the same but for rounding.
+    half = np.maximum(0.5 * np.linalg.norm(omega, axis=1, keepdims=True), 5e-5)
+    factor = 0.25 * (1.0 - half / np.tan(half)) / half**2
+    turned = np.cross(omega, shift)
+    velocity = shift - 0.5 * turned + factor * np.cross(omega, turned)
+    return np.hstack([omega, velocity])
 
 
 @loop
@@ -124,23 +136,3 @@ def exponential_loop(points, twists, out):
             out[n, a] = point[a] + velocity[a] + first * turned[a]
             out[n, a] += second * (twice[a] + swept[a])
             out[n, a] += third * swept_twice[a]
-
-
-@loop
-def logarithm_loop(motions, twists):
-    """Twists (omega, velocity) of rigid motions (b, 4, 4)."""
-    for n in range(len(motions)):
-        w, a, b, c = matrix_quaternion(motions[n])
-        sine = np.sqrt(dot((a, b, c), (a, b, c)))
-        half = np.arctan2(sine, abs(w))
-        share = np.copysign(2.0 * half / sine if sine > 1e-8 else 2.0, w)
-        third = 1.0 / 12.0 + half * half / 180.0
-        if half > 5e-5:
-            third = (0.25 - 0.25 * half * abs(w) / sine) / (half * half)
-        omega = share * a, share * b, share * c
-        shift = motions[n, 0, 3], motions[n, 1, 3], motions[n, 2, 3]
-        turned = cross(omega, shift)
-        twice = cross(omega, turned)
-        for k in range(3):
-            twists[n, k] = omega[k]
-            twists[n, 3 + k] = shift[k] - 0.5 * turned[k] + third * twice[k]

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
 from rbfmuscle.geometry.frames import turned_quaternions
-from rbfmuscle.geometry.harmonic import exponential_loop, logarithm_loop
+from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.solid.metric import Metric
 from rbfmuscle.solid.model import ANTI_BUCKLING_TENSION, GREATEST_TENSION, SolidModel
 
@@ -80,14 +80,11 @@ def tension(model: SolidModel, anchors: Floats) -> float:
 def predict(model: SolidModel, state: SolidState, before: Floats, after: Floats) -> SolidState:
     """The state after the bones moved between two sets of poses (b, 4, 4).
 
-    Nodes take a mean of the bones' motions: the twists are averaged with the nodes' weights.
+    Nodes take the mean of the bones' motions with the nodes' weights, see `blended_motion`.
     Where the motion goes on as before, so does the last correction. Contact points are those of
     the mean motion alone, from which a solve tells what passed through a bone.
     """
-    twists = np.empty((len(before), 6))
-    logarithm_loop(np.ascontiguousarray(after @ np.linalg.inv(before)), twists)
-    start = np.empty_like(state.nodes)
-    exponential_loop(state.nodes, model.motion_weights @ twists, start)
+    start = blended_motion(state.nodes, model.motion_weights, after @ np.linalg.inv(before))
     pose = after[model.held_bone]
     held = model.points[model.held]
     anchors = np.einsum("hab,hb->ha", pose[:, :3, :3], held) + pose[:, :3, 3]
