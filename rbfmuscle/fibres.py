@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size, unit
 from rbfmuscle.geometry.lines import nearest_pieces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
+from rbfmuscle.geometry.surfaces import even_points
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, resampled, split_ends
 from rbfmuscle.metrics.rows import bones_about
@@ -35,6 +36,7 @@ SPARE = 1.5  # lines traced for each one wanted, as some do not reach both ends
 ROUNDS = 4  # in which points are moved into the muscle and out of bones
 DEPTH = 0.05  # of points inside the surface, in cells
 PATCH_POINTS = 3000  # of an end
+SURFACE_APART = 0.4  # of points that find the cells which the surface passes through, in cells
 _CORNERS = np.indices((2, 2, 2)).reshape(3, -1).T  # of a cell, (8, 3)
 
 
@@ -113,6 +115,8 @@ class FluxField:
         """Cells (m, 3) of which the middle lies inside, those of the ends, and, where these are not
         joined, those that the surface passes through.
         """
+        from trimesh.remesh import subdivide_to_size
+
         every = np.indices(self.shape).reshape(3, -1).T
         inside = mesh.inside(self.low + (every + 0.5) * self.side).reshape(self.shape)
         at_ends = [self._cell_of(end) for end in ends]
@@ -120,7 +124,10 @@ class FluxField:
             inside[tuple(cell.T)] = True
         piece, joined = self._piece(inside, at_ends)
         if not joined:
-            inside[tuple(self._cell_of(_surface_points(mesh, 0.4 * self.side)).T)] = True
+            points, _ = subdivide_to_size(
+                mesh.vertices, mesh.faces, SURFACE_APART * self.side, max_iter=30
+            )
+            inside[tuple(self._cell_of(points).T)] = True
             piece, joined = self._piece(inside, at_ends)
             if not joined:
                 raise np.linalg.LinAlgError("origin and insertion lie in separate pieces")
@@ -168,17 +175,6 @@ class FluxField:
         known[where] = True
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         self._flux = grid[tuple(nearest)]
-
-
-def _surface_points(mesh: MeshDistance, apart: float) -> Floats:
-    """Points on a surface that are not farther apart than a distance, about."""
-    corners = mesh.vertices[mesh.faces]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max()
-    count = int(min(np.ceil(longest / apart), 20))
-    shares = np.array(
-        [(i, j, count - i - j) for i in range(count + 1) for j in range(count + 1 - i)], dtype=float
-    )
-    return np.asarray(np.einsum("sk,fka->sfa", shares / count, corners).reshape(-1, 3))
 
 
 def _conductivity(points: Floats, polylines: Sequence[Floats] | None) -> Floats:
@@ -452,7 +448,7 @@ def _end_points(mesh: MeshDistance, patches: Sequence[Integers]) -> tuple[Floats
         owner[patch] = number
     corners = owner[mesh.faces]
     whole = (corners[:, 0] >= 0) & (corners == corners[:, :1]).all(axis=1)
-    points, face = _on_faces(mesh.vertices, mesh.faces[whole], PATCH_POINTS)
+    points, face = even_points(mesh.vertices, mesh.faces[whole], PATCH_POINTS)
     number = corners[whole][face, 0]
     # Patches without a whole triangle count by their vertices.
     for k, patch in enumerate(patches):
@@ -460,19 +456,3 @@ def _end_points(mesh: MeshDistance, patches: Sequence[Integers]) -> tuple[Floats
             points = np.concatenate([points, mesh.vertices[patch]])
             number = np.concatenate([number, np.full(len(patch), k)])
     return points, number
-
-
-def _on_faces(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
-    """So many points (n, 3) evenly over the area of triangles, and the triangle (n,) of each."""
-    if not len(faces):
-        return np.empty((0, 3)), np.empty(0, dtype=np.int64)
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    number = np.arange(count) + 0.5
-    face = np.searchsorted(area, number / count * area[-1])
-    # The additive recurrence of the plastic number spreads points evenly (Roberts 2018).
-    share = (number[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1.0
-    over = share.sum(axis=1) > 1.0
-    share[over] = 1.0 - share[over]
-    s, t = share.T[:, :, None]
-    return a[face] + s * (b - a)[face] + t * (c - a)[face], face

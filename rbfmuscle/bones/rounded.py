@@ -14,9 +14,10 @@ import numpy as np
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, unit
 from rbfmuscle.geometry.frames import RestFrame, box_corners, dot, minus, row_of
 from rbfmuscle.geometry.interpolation import bspline_sum
+from rbfmuscle.geometry.surfaces import even_points, face_normals
 from rbfmuscle.loops import loop
 
 SIDE = 4  # cells along a block
@@ -78,13 +79,9 @@ def bone_thickness(bone: BoneSDF, most: float) -> float:
     Twice the depth that a path into the bone, from the middle of a face against its normal,
     reaches.
     """
-    a, b, c = (bone.vertices[bone.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    area = np.linalg.norm(normal, axis=1)
-    share = (np.arange(PROBES) + 0.5) / PROBES * area.sum()
-    chosen = np.minimum(np.searchsorted(np.cumsum(area), share), len(area) - 1)
-    start = (a + b + c)[chosen] / 3.0
-    way = -normal[chosen] / np.maximum(area[chosen], 1e-300)[:, None]
+    probed = bone.faces[even_points(bone.vertices, bone.faces, PROBES)[1]]
+    start = bone.vertices[probed].mean(axis=1)
+    way = -unit(face_normals(bone.vertices, probed))
     depth = np.zeros(PROBES)
     for t in np.linspace(0.0, most, STEPS_IN + 1)[1:]:
         depth = np.maximum(depth, -bone.distance(start + t * way))

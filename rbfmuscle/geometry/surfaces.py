@@ -165,6 +165,24 @@ def vertex_areas(vertices: Floats, faces: Integers) -> Floats:
     return np.bincount(faces.ravel(), np.repeat(third, 3), minlength=len(vertices)).astype(float)
 
 
+def even_points(vertices: Floats, faces: Integers, count: int) -> tuple[Floats, Integers]:
+    """Points (count, 3) evenly over the area of a mesh, and the triangle (count,) that holds each;
+    none where there are no triangles.
+    """
+    if not len(faces):
+        return np.empty((0, 3)), np.empty(0, dtype=np.int64)
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    number = np.arange(count) + 0.5
+    face = np.searchsorted(area, number / count * area[-1])
+    # The additive recurrence of the plastic number spreads points evenly (Roberts 2018).
+    share = (number[:, None] * [0.7548776662466927, 0.5698402909980532]) % 1.0
+    over = share.sum(axis=1) > 1.0
+    share[over] = 1.0 - share[over]
+    s, t = share.T[:, :, None]
+    return a[face] + s * (b - a)[face] + t * (c - a)[face], face
+
+
 def barycentric_weights(points: Floats, corners: Floats) -> Floats:
     """Weights (n, 3) in [0, 1] of the corners (n, 3, 3) of one triangle for each point (n, 3) in or
     near it.

@@ -505,20 +505,6 @@ def _edge_sum(i: Integers, j: Integers, values: Floats, size: int) -> Floats:
     return np.asarray(np.bincount(i, values, size) + np.bincount(j, values, size), dtype=np.float64)
 
 
-def spread_points(
-    vertices: Floats, faces: Integers, count: int, *, seed: int = 0
-) -> tuple[Floats, Integers]:
-    """Points (count, 3) on a mesh, one in each strip of equal area, and the triangle (count,) that
-    holds each.
-    """
-    vertices, faces = check_mesh(vertices, faces)
-    rng = np.random.default_rng(seed)
-    area = np.linalg.norm(face_normals(vertices, faces), axis=1)
-    strip = (np.arange(count) + rng.uniform(size=count)) / count
-    which = np.searchsorted(np.cumsum(area) / area.sum(), strip).clip(max=len(faces) - 1)
-    return np.einsum("nk,nkj->nj", rng.dirichlet(np.ones(3), count), vertices[faces[which]]), which
-
-
 def _gather(fine: FineMesh, count: int, labels: Integers, control: Integers) -> SurfaceSample:
     """Points and normals of the cells."""
     vectors = face_normals(fine.vertices, fine.faces)

@@ -38,17 +38,18 @@ from rbfmuscle.folders import OutputFolder
 from rbfmuscle.geometry.arrays import Floats, Integers, MeshLike, unit
 from rbfmuscle.geometry.frames import principal_axes
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import face_normals, mesh_hash, mesh_volume, vertex_areas
+from rbfmuscle.geometry.surfaces import (
+    even_points,
+    face_normals,
+    mesh_hash,
+    mesh_volume,
+    vertex_areas,
+)
 from rbfmuscle.geometry.threads import blas_limited, cores_limited, each, threads_limited
 from rbfmuscle.implicit.extraction import extract_surface, find_sheets
 from rbfmuscle.implicit.field import FieldFit, RBFField, overlapping_parts
 from rbfmuscle.implicit.kernels import KERNELS, Kernel, get_kernel
-from rbfmuscle.implicit.placement import (
-    GREEDY_LARGEST,
-    SurfaceSample,
-    sample_surface,
-    spread_points,
-)
+from rbfmuscle.implicit.placement import GREEDY_LARGEST, SurfaceSample, sample_surface
 from rbfmuscle.implicit.selection import BOUND, SCAN, SPAN, choose_epsilon, spacing
 from rbfmuscle.metrics.summary import shown_number
 from rbfmuscle.progress import stage
@@ -324,9 +325,9 @@ class ReferenceSurface:
             np.clip(CELLS * np.ptp(vertices @ self.axes[0]) / radius, *RANGE)
         )
         self.distance = MeshDistance(vertices, faces)
-        self.points, which = spread_points(vertices, faces, JUDGES)
+        self.points, which = even_points(vertices, faces, JUDGES)
         self.normals = unit(face_normals(vertices, faces)[which])
-        self.held_out = spread_points(vertices, faces, HELD_OUT, seed=1)[0]
+        self.held_out = even_points(vertices, faces, HELD_OUT)[0]
 
     def apart(self, vertices: Floats, faces: Integers) -> tuple[float, float]:
         """RMS and greatest distance of a surface, both ways [length]."""

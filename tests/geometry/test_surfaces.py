@@ -14,6 +14,7 @@ from rbfmuscle.geometry.frames import RestFrame
 from rbfmuscle.geometry.surfaces import (
     EdgeLengths,
     edge_lengths,
+    even_points,
     face_normals,
     farthest_move,
     geodesic,
@@ -30,6 +31,25 @@ from rbfmuscle.geometry.surfaces import (
 
 BOX = trimesh.creation.box((2.0, 3.0, 4.0)).subdivide()
 VERTICES, FACES = np.array(BOX.vertices), np.array(BOX.faces)
+
+
+def test_even_points_lie_on_their_triangles_as_many_as_the_area_of_each():
+    stretched, count = VERTICES * [5.0, 1.0, 0.3], 20_000
+    points, face = even_points(stretched, FACES, count)
+    weights = trimesh.triangles.points_to_barycentric(stretched[FACES[face]], points)
+    assert weights.min() > -1e-12
+    back = np.einsum("nk,nkd->nd", weights, stretched[FACES[face]])
+    np.testing.assert_allclose(back, points, atol=1e-12)
+    area = np.linalg.norm(face_normals(stretched, FACES), axis=1)
+    share = np.bincount(face, minlength=len(FACES)) - count * area / area.sum()
+    assert np.abs(share).max() <= 1.0  # whole points
+    # The middle of a triangle's points is that of the triangle, but for their distance.
+    middle = np.stack([np.bincount(face, points[:, k]) for k in range(3)], 1)
+    middle /= np.bincount(face)[:, None]
+    size = np.ptp(stretched[FACES], axis=1).max(axis=1)
+    missed = np.linalg.norm(middle - stretched[FACES].mean(axis=1), axis=1)
+    assert (missed < 0.05 * size).all()
+    assert len(even_points(stretched, FACES[:0], count)[0]) == 0
 
 
 def test_area_vectors_are_the_sides_of_a_box_and_sum_to_nothing():

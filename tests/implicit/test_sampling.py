@@ -7,9 +7,10 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from rbfmuscle.geometry.exact_distance import ExactDistance
+from rbfmuscle.geometry.surfaces import even_points
 from rbfmuscle.implicit import placement
 from rbfmuscle.implicit.field import RBFField, off_surface_points
-from rbfmuscle.implicit.placement import contract_clusters, sample_surface, spread_points
+from rbfmuscle.implicit.placement import contract_clusters, sample_surface
 from rbfmuscle.validation import MeshError
 
 SHAPES = {
@@ -54,7 +55,7 @@ def test_sphere_is_covered_evenly_with_radial_normals():
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
     sample = sample_surface(mesh.vertices, mesh.faces, 300, placement="even")
     # Area nearest to each point, by many points spread evenly.
-    points = spread_points(mesh.vertices, mesh.faces, 40_000)[0]
+    points = even_points(mesh.vertices, mesh.faces, 40_000)[0]
     share = np.bincount(trimesh.proximity.cKDTree(sample.points).query(points)[1], minlength=300)
     assert share.std() / share.mean() < 0.12  # 0.09 of it by the 130 points that measure a cell
     gaps = trimesh.proximity.cKDTree(sample.points).query(sample.points, k=2)[0][:, 1]
