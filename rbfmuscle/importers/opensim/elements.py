@@ -527,5 +527,6 @@ def _read_multivariate(node):
         raise node.owner.error(
             f"a polynomial of {dimension} coordinates and order {order}: {words}"
         )
-    rows = zip(coefficients, powers.tolist())
-    return Multivariate(tuple((c, *map(int, row)) for c, row in rows if c))
+    terms = [(c, *row) for c, row in zip(coefficients, powers.tolist())]
+    # Of zeros alone the constant says how many coordinates it is of.
+    return Multivariate(tuple(term for term in terms if term[0]) or (terms[0],))

@@ -282,6 +282,14 @@ def test_polynomials_of_several_coordinates_and_empty_functions(read, tmp_path):
     check_written(tmp_path, {"c.q": 0.2, "c.r": 0.4})
 
 
+def test_a_polynomial_of_zeros_moves_nothing(read, tmp_path):
+    functions = FUNCTIONS | {"translation2": ("q r", SUM.replace("0.1 1 2 0.3 0.4 0.5", "0 " * 6))}
+    own = coordinate("q", 0.5) + coordinate("r", -0.3)
+    found = read(model("a", [axis_joint("c", "ground", "a", functions, own)]))
+    assert found.transforms()["a"][1, 3] == 0.0
+    check_written(tmp_path, {"c.q": 0.2, "c.r": 0.4})
+
+
 def test_an_axis_without_a_function_moves_nothing(read):
     functions = {"rotation1": ("q", ""), "rotation2": ("r", "<function/>")}
     own = coordinate("q", 0.5) + coordinate("r", -0.3)
