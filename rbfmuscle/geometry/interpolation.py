@@ -106,19 +106,14 @@ class SurfaceInterpolation:
     """
 
     def __init__(self, vertices: Floats, points: Floats) -> None:
+        from scipy.interpolate import RBFInterpolator
+
         self.points = points
         self.chosen = spread_points(vertices, CENTRES)
         self.rest = vertices[self.chosen]
-        middle = self.rest.mean(axis=0)
-        size = float(np.linalg.norm(np.ptp(self.rest, axis=0)))
-        centres = (self.rest - middle) / size
-        rows = _row(centres, centres)
-        count = len(centres)
-        matrix = np.zeros((count + 4, count + 4))
-        matrix[:count] = rows
-        matrix[count:, :count] = rows[:, count:].T
-        self.weights = np.linalg.solve(matrix.T, _row((points - middle) / size, centres).T)
-        self.weights = np.ascontiguousarray(self.weights[:count].T)
+        # The spline is linear in what it passes through: of each centre alone it is its weights.
+        alone = np.eye(len(self.rest))
+        self.weights = RBFInterpolator(self.rest, alone, kernel="cubic", degree=1)(points)
 
     def __call__(self, vertices: Floats) -> Floats:
         """Places (m, 3) of the points where the vertices (n, 3) are now."""
@@ -138,10 +133,3 @@ def spread_points(points: Floats, count: int) -> Integers:
         np.minimum(distance, np.einsum("ij,ij->i", offset, offset), out=distance)
         chosen[k] = distance.argmax()
     return chosen
-
-
-def _row(points: Floats, centres: Floats) -> Floats:
-    """Kernels about the centres (m, 3), then 1, x, y and z, at points (n, 3)."""
-    from scipy.spatial.distance import cdist
-
-    return np.hstack([cdist(points, centres) ** 3, np.ones((len(points), 1)), points])
