@@ -5,7 +5,7 @@ directions of fibres that follow lines.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers, unit
 from rbfmuscle.geometry.frames import dot, row_of
@@ -14,7 +14,7 @@ from rbfmuscle.loops import loop
 # Vertices around a tube, where nothing else is asked for.
 SIDES = 12
 STEEPEST = 2.0  # greatest slope of a line against the chord of its ends
-DIRECTIONS = 64  # directions in which a convex hull is begun
+LEAST_BEND = 1e-9  # height of an obstacle above a chord, over its length, from which on it counts
 
 
 def distance_along(line: Floats) -> Floats:
@@ -96,7 +96,10 @@ def taut_line(
         profile.append(found[: _profile_loop(points, turn, shift, size, max(width, 1e-300), found)])
     if not any(len(found) for found in profile):
         return np.stack([start, end])
-    return start + _upper_hull(np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])) @ axes[:2]
+    # All obstacles lie above the chord, which is the lower side of their hull with both ends.
+    places = np.concatenate([[[0.0, 0.0], [size, 0.0]], *profile])
+    hull = places[ConvexHull(places).vertices]
+    return start + hull[np.argsort(hull[:, 0])] @ axes[:2]
 
 
 @loop
@@ -113,30 +116,10 @@ def _profile_loop(points, turn, shift, size, width, found):
         y = dot(row_of(turn, 1), point) + shift[1]
         z = dot(row_of(turn, 2), point) + shift[2]
         y = min(y, 2.0 * STEEPEST * min(x, size - x) - y) - z * z / (2.0 * width)
-        if y > 0.0:
+        if y > LEAST_BEND * size:
             found[count, 0], found[count, 1] = x, y
             count += 1
     return count
-
-
-def _upper_hull(points: Floats) -> Floats:
-    """Upper convex hull (k, 2) of points (n, 2), from left to right (Andrew 1979)."""
-    # Nearly all points lie below the hull of those that are outermost in some directions.
-    angles = np.linspace(0.0, np.pi, DIRECTIONS)
-    outermost = np.unique(
-        np.argmax(np.stack([-np.cos(angles), np.sin(angles)], axis=1) @ points.T, axis=1)
-    )
-    outermost = outermost[np.argsort(points[outermost, 0], kind="stable")]
-    above = points[:, 1] >= np.interp(points[:, 0], *points[outermost].T)
-    hull: list[Floats] = []
-    for point in points[above][np.lexsort(points[above].T[::-1])]:
-        while len(hull) > 1:
-            (ax, ay), (bx, by) = hull[-2], hull[-1]
-            if (bx - ax) * (point[1] - ay) < (by - ay) * (point[0] - ax):
-                break
-            hull.pop()
-        hull.append(point)
-    return np.array(hull)
 
 
 # Pieces of polyline whose directions are averaged at one place.
