@@ -20,6 +20,7 @@ from rbfmuscle.geometry.harmonic import blended_motion
 from rbfmuscle.geometry.interpolation import SurfaceInterpolation
 from rbfmuscle.geometry.surfaces import vertex_areas, vertex_normals
 from rbfmuscle.loops import loop
+from rbfmuscle.scene.motion import turned_angle
 from rbfmuscle.scene.muscles import attachment_frames
 from rbfmuscle.scene.objects import Muscle, from_mm
 from rbfmuscle.scene.scene import Scene
@@ -120,7 +121,9 @@ class PBDMuscle:
         old, new = np.array([[poses[bone] for bone in bones] for poses in (before, after)])
         motions = new @ np.linalg.inv(old)
         motions[(old == new).all(axis=(1, 2))] = IDENTITY  # exactly
-        self.time = max(1.0, _largest_angle(motions) / STEP_ANGLE)
+        # From each bone to each other one.
+        turns = motions[:, None, :3, :3] @ np.swapaxes(motions[:, :3, :3], 1, 2)
+        self.time = max(1.0, float(turned_angle(turns).max()) / STEP_ANGLE)
         if not (motions == IDENTITY).all():
             self.points[:] = blended_motion(self.points, rest.weights, motions)
         _place_loop(rest.vertices, rest.attached_bone, new, self.points)
@@ -242,13 +245,3 @@ def _place_loop(rest, attached_bone, poses, points):
                 points[i, a] = poses[b, a, 3]
                 for k in range(3):
                     points[i, a] += poses[b, a, k] * rest[i, k]
-
-
-def _largest_angle(motions):
-    """Largest angle between any two of the motions [radian]."""
-    largest = 0.0
-    for i, one in enumerate(motions):
-        for other in motions[:i]:
-            turn = one[:3, :3] @ other[:3, :3].T
-            largest = max(largest, math.acos(min(1.0, max(-1.0, 0.5 * (np.trace(turn) - 1.0)))))
-    return largest

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from pbd_baseline.constraints import VolumeConstraint
 from pbd_baseline.topology import Topology, cache_order
 from rbfmuscle.cache import content_key, load_arrays, store_arrays
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, unit
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size, unit
 from rbfmuscle.geometry.harmonic import (
     cotangent_laplacian,
     graph_laplacian,
@@ -142,7 +142,7 @@ def swelling_room(vertices: Floats, faces: Integers, normals: Floats, held: Bool
     Smooth, [unit of the vertices], 0 at held vertices.
     """
     radius = _inner_balls(vertices, normals)
-    reach = SMOOTHING * float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    reach = SMOOTHING * box_size(vertices)
     area = vertex_areas(vertices, faces)
     free = np.flatnonzero(~held)
     room = np.zeros(len(vertices))

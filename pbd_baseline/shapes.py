@@ -17,7 +17,7 @@ from pbd_baseline.constraints import BendingConstraint, ContactConstraint, EdgeC
 from pbd_baseline.contraction import TENDON_WEIGHT, MeshFibres
 from pbd_baseline.rest import PBDOptions, RestState, edge_stiffness
 from pbd_baseline.topology import Topology, colour, members_in_order
-from rbfmuscle.geometry.arrays import Floats
+from rbfmuscle.geometry.arrays import Floats, box_size
 from rbfmuscle.geometry.frames import rotate, row_of, turn_towards, turned_quaternions
 from rbfmuscle.geometry.harmonic import cotangent_laplacian, graph_laplacian
 from rbfmuscle.geometry.surfaces import vertex_areas
@@ -321,7 +321,7 @@ class GlobalARAPShape(Shape):
         self.quaternions = self.arap.quaternions
         self.free = np.flatnonzero(rest.inverse_mass > 0.0)
         self.held = np.flatnonzero(rest.inverse_mass == 0.0)
-        reach = STEP_REACH * float(np.linalg.norm(np.ptp(rest.vertices, axis=0)))
+        reach = STEP_REACH * box_size(rest.vertices)
         self.mass = vertex_areas(rest.vertices, rest.topology.faces)[self.free, None] / reach**2
         rows = self.arap.laplacian[self.free]
         matrix = (rows[:, self.free] + sparse.diags(self.mass[:, 0])).tocsc()

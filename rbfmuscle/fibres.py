@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size, unit
 from rbfmuscle.geometry.lines import nearest_pieces
 from rbfmuscle.geometry.mesh_distance import MeshDistance
-from rbfmuscle.geometry.surfaces import even_points
+from rbfmuscle.geometry.surfaces import even_points, mesh_volume
 from rbfmuscle.geometry.threads import each
 from rbfmuscle.metrics.centreline import moving_joints, resampled, split_ends
 from rbfmuscle.metrics.rows import bones_about
@@ -74,8 +74,7 @@ class FluxField:
         low = mesh.vertices.min(axis=0)
         extent = np.ptp(mesh.vertices, axis=0)
         # Side of a cell [scene unit] with which the muscle has about `CELLS`.
-        a, b, c = (mesh.vertices[mesh.faces[:, k]] - mesh.vertices[0] for k in range(3))
-        volume = abs(float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())) / 6.0
+        volume = abs(mesh_volume(mesh.vertices, mesh.faces))
         self.side = float(max((volume / CELLS) ** (1 / 3), extent.max() / 1000.0))
         self.low = low - 1.5 * self.side
         self.shape = np.ceil(extent / self.side).astype(int) + 3

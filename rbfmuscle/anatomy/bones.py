@@ -285,9 +285,7 @@ def _is_below(femur: Part, cut: Cut, bones: list[Part]) -> bool:
         return sum(near) > 0
     far = (femur.points - cut.middle) @ -cut.normal
     broad = across(femur.points[far > (1.0 - END) * far.max()] - cut.middle, cut.normal)
-    return float(np.linalg.norm(broad.mean(axis=0))) > HEAD_ASIDE * float(
-        np.linalg.norm(np.ptp(broad, axis=0))
-    )
+    return float(np.linalg.norm(broad.mean(axis=0))) > HEAD_ASIDE * box_size(broad)
 
 
 def _stump_frame(femur: Part, cut: Cut) -> Orientation:
@@ -301,7 +299,7 @@ def _stump_frame(femur: Part, cut: Cut) -> Orientation:
     height = (femur.points - cut.middle) @ up
     top = femur.points[height > (1.0 - HEAD_SHARE) * height.max()]
     # Further down the shaft is bowed forwards.
-    breadth = float(np.linalg.norm(np.ptp(across(femur.points - cut.middle, up), axis=0)))
+    breadth = box_size(across(femur.points - cut.middle, up))
     below = max(height.max() - BELOW_HEAD * breadth, 0.0)
     shaft = femur.points[np.abs(height - below) < HEAD_SHARE * breadth].mean(axis=0)
     inward = unit(across(top.mean(axis=0) - shaft, up))

@@ -23,7 +23,7 @@ from rbfmuscle.geometry.arrays import Array, Booleans, Floats, to_world
 from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.exact_distance import faces_across
 from rbfmuscle.geometry.solids import label_shells
-from rbfmuscle.geometry.surfaces import mesh_volume, vertex_areas, vertex_normals
+from rbfmuscle.geometry.surfaces import mesh_volume, simplified, vertex_areas, vertex_normals
 from rbfmuscle.importers.guess.guess import SceneGuess, guess_scene, scene_in_memory
 from rbfmuscle.scene.objects import new_name, plain_name
 from rbfmuscle.scene.scene import Scene
@@ -545,7 +545,6 @@ def _draw(mask, others, notes, pieces):
 
 def _surface_of(mask, notes):
     """Vertices [voxels] and faces of a mask, of its volume where it is not too thin for that."""
-    import igl
     from skimage.measure import marching_cubes
 
     # A field that is positive inside, zero about half-way between voxels in and out.
@@ -559,12 +558,9 @@ def _surface_of(mask, notes):
         return np.zeros((1, 3)), np.zeros((0, 3), np.int64)
     vertices, faces, _, _ = marching_cubes(-smooth, 0.0, allow_degenerate=False)
     vertices, faces = vertices.astype(np.float64), faces.astype(np.int64)
-    # Fewer triangles by quadric edge collapse (Garland and Heckbert 1997), of about the edge that
-    # is wanted.
+    # Fewer triangles, of about the edge that is wanted.
     target = max(200, int(vertex_areas(vertices, faces).sum() / (np.sqrt(3.0) / 4.0 * EDGE**2)))
-    if target < len(faces):
-        vertices, faces = (np.asarray(part) for part in igl.qslim(vertices, faces, target)[:2])
-    faces = faces.astype(np.int64)
+    vertices, faces = simplified(vertices, faces, target)
     # Edges that collapse on either side of a thin wall fold it, or bring its sides through each
     # other.
     vertices, crossing = _untangled(vertices, faces, smooth)

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, ValidationInfo, model_validator
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, box_size
+from rbfmuscle.geometry.surfaces import barycentric_weights, edge_lengths
 from rbfmuscle.scene.bone import Bone
 from rbfmuscle.scene.meshes.read import MeshTransform, read_part, read_vertex_array
 from rbfmuscle.scene.meshes.repair import ReadMesh
@@ -112,7 +113,6 @@ def region_vertices(
     other mesh to the scene.
     """
     import igl
-    from trimesh.triangles import points_to_barycentric
 
     try:
         part = read_part(path)
@@ -122,23 +122,19 @@ def region_vertices(
     if colour is not None:
         painted = _painted(colour, path, len(part.vertices), context)
     other = transform.points(part.vertices)
-    square, faces, places = igl.point_mesh_squared_distance(
+    square, nearest, places = igl.point_mesh_squared_distance(
         np.asarray(mesh.vertices), other, np.ascontiguousarray(part.faces)
     )[:3]
-    corners = part.faces[faces]
-    share = (points_to_barycentric(other[corners], places) * painted[corners]).sum(axis=1)
-    edge = max(_edge(np.asarray(mesh.vertices), np.asarray(mesh.faces)), _edge(other, part.faces))
+    corners = part.faces[nearest]
+    share = (barycentric_weights(places, other[corners]) * painted[corners]).sum(axis=1)
+    own = np.median(edge_lengths(np.asarray(mesh.vertices), np.asarray(mesh.faces)[:, :2]))
+    edge = max(own, np.median(edge_lengths(other, part.faces[:, :2])))
     away = np.sqrt(square)
     chosen = np.flatnonzero((share >= 1 / 2) & (away <= 0.5 * edge))
     if not len(chosen):
         words = f"the nearest is {away.min():.4g} away" if painted.any() else "nothing is painted"
         raise SceneError(f"{context}no vertex of the muscle lies on {shown_path(path)}, {words}")
     return chosen
-
-
-def _edge(vertices: Floats, faces: Integers) -> float:
-    """Median length of the edges."""
-    return float(np.median(np.linalg.norm(vertices[faces[:, 0]] - vertices[faces[:, 1]], axis=1)))
 
 
 def _check_vertices(value: object, info: ValidationInfo) -> object:

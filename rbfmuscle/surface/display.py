@@ -11,7 +11,12 @@ import numpy as np
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.frames import RestFrame, principal_axes
-from rbfmuscle.geometry.surfaces import face_normals, opposite_half_edges, vertex_normals
+from rbfmuscle.geometry.surfaces import (
+    edge_lengths,
+    face_normals,
+    opposite_half_edges,
+    vertex_normals,
+)
 from rbfmuscle.implicit.placement import cached_sample
 from rbfmuscle.loops import loop
 from rbfmuscle.scene.objects import Muscle
@@ -65,7 +70,7 @@ def _unfold(points: Floats, faces: Integers, start: Integers, other: Integers) -
             break
         _smooth_loop(smooth, np.unique(faces[folded]), start, other)
     way = np.linalg.norm(smooth - points, axis=1).max()
-    if way < UNFOLD_WAY * np.linalg.norm(points[faces[:, 0]] - points[faces[:, 1]], axis=1).mean():
+    if way < UNFOLD_WAY * edge_lengths(points, faces[:, :2]).mean():
         points[:] = smooth
 
 
