@@ -294,7 +294,8 @@ def _solve_some(
         if failed:
             raise np.linalg.LinAlgError("the matrix is not definite")
     solved[:, 1] = _probe(np.diagonal(a, axis1=1, axis2=2))
-    _substitute_loop(a, solved)
+    for matrix, both in zip(a, solved):
+        lapack.dpotrs(matrix.T, both.T, lower=1, overwrite_b=1)  # in place
     weights = annihilating(solved[:, 0])
     short = turned @ right[:, :, None] - np.swapaxes(products, 1, 2) @ weights[:, :, None]
     condition = np.maximum(1.0, norm * np.linalg.norm(solved[:, 1], axis=1))
@@ -332,24 +333,6 @@ def _subtract_loop(a, directions, half):
                 one, other = directions[p, k, i], half[p, k, i]
                 for j in range(size):
                     a[p, i, j] -= one * half[p, k, j] + other * directions[p, k, j]
-
-
-@loop(fastmath={"contract", "reassoc"})
-def _substitute_loop(upper, both):
-    """Solve U^T U x = b in place for two right sides (m, 2, size)."""
-    size = upper.shape[1]
-    for p in range(len(upper)):
-        for x in both[p]:
-            for j in range(size):
-                x[j] /= upper[p, j, j]
-                share = x[j]
-                for i in range(j + 1, size):
-                    x[i] -= share * upper[p, j, i]
-            for j in range(size - 1, -1, -1):
-                total = 0.0
-                for i in range(j + 1, size):
-                    total += upper[p, j, i] * x[i]
-                x[j] = (x[j] - total) / upper[p, j, j]
 
 
 def _warn(basis: Basis) -> None:
