@@ -38,88 +38,12 @@ def _skfem():
     return skfem
 
 
-class HexSolid:
-    """A solid of bricks.
+class Equilibrium:
+    """Newton's method for whatever has an energy.
 
-    Parameters
-    ----------
-    points : (n, 3) ndarray
-        Corners at rest [scene unit].
-    cells : (m, 8) ndarray of int
-        In scikit-fem's order, as `brick_grid` gives them.
-    shear : float
-        Shear modulus; the unit of stress.
-    poisson : float
-        Poisson's ratio; 0.495 makes the bulk modulus a hundred times the shear modulus.
-    fibres : FibreMaterial, optional
-    stiffer : (m,) ndarray, optional
-        Factor of the shear and bulk moduli of each cell.
-    penalty : float
-        Contact pressure for each unit of depth [shear modulus / scene unit].
-
-    Attributes
-    ----------
-    rest : (N, 3) ndarray
-        Nodes, of which the first are the corners.
-
-    Raises
-    ------
-    MissingDependencyError
-        If scikit-fem is not installed.
+    A class that derives from it has the nodes ``rest`` (n, 3), a modulus ``shear`` and the
+    functions ``energy(displacement)`` and ``_assemble(displacement, positive=False)``.
     """
-
-    kind, integrated = (
-        ("MeshHex", "ElementHex1"),
-        3,
-    )  # in scikit-fem, and the degree that is integrated exactly
-
-    def __init__(
-        self, points, cells, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None
-    ):
-        skfem = _skfem()
-        self.shear, self.penalty = shear, penalty
-        self.fibres, self.activation = fibres, 0.0
-        self.stiffer = np.ones(len(cells)) if stiffer is None else np.asarray(stiffer, dtype=float)
-        self.bulk = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
-        mesh, element = (getattr(skfem, name) for name in self.kind)
-        mesh = mesh(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
-        element = element()
-        basis = skfem.Basis(mesh, element, intorder=self.integrated)
-        self.mesh, self.rest = mesh, np.ascontiguousarray(basis.doflocs.T)
-        # (cell, quadrature point, node, direction): derivatives of the shape functions at rest.
-        self.slopes = np.stack([np.moveaxis(b[0].grad, 0, -1) for b in basis.basis], axis=2)
-        self.weights, self.nodes = basis.dx, basis.element_dofs.T
-        self.facets = mesh.boundary_facets()
-        side = skfem.FacetBasis(mesh, element, facets=self.facets, intorder=3)
-        self.side_shape = np.stack(
-            [np.broadcast_to(np.asarray(b[0]), side.dx.shape) for b in side.basis], axis=-1
-        )
-        self.side_weights, self.side_nodes = np.abs(side.dx), side.element_dofs.T
-        self.side_cells = mesh.f2t[0, self.facets]
-        self.obstacles = ()
-        self.places = None
-
-    def surface_faces(self):
-        """Corner nodes of the boundary, (k, 4) or (k, 3), in scikit-fem's order."""
-        return self.mesh.facets[:, self.facets].T
-
-    def set_obstacles(self, obstacles, attached):
-        """Bones that push.
-
-        Parameters
-        ----------
-        obstacles : callable
-            ``obstacles(points)`` gives distances (n,), negative inside, and directions (n, 3).
-        attached : (n,) ndarray of bool
-            Nodes on bones; faces with any of them take no contact.
-        """
-        self.obstacles = obstacles
-        on_face = np.abs(self.side_shape).max(axis=1) > 1e-9
-        self.touching = ~(attached[self.side_nodes] & on_face).any(axis=1)
-
-    def volume(self, displacement):
-        """Volume of the deformed cells [scene unit cubed]."""
-        return float((np.linalg.det(self._gradient(displacement)) * self.weights).sum())
 
     def solve(self, displacement, held, wanted, *, tolerance=1e-6, settled=ENERGY_TOLERANCE):
         """Equilibrium with what is ``held`` at the displacements ``wanted`` (n, 3).
@@ -195,6 +119,120 @@ class HexSolid:
                 return u + share * step
             share *= 0.5
         raise SolveError("no step lowers the energy, take smaller steps")
+
+
+class HexSolid(Equilibrium):
+    """A solid of bricks.
+
+    Parameters
+    ----------
+    points : (n, 3) ndarray
+        Corners at rest [scene unit].
+    cells : (m, 8) ndarray of int
+        In scikit-fem's order, as `brick_grid` gives them.
+    shear : float
+        Shear modulus; the unit of stress.
+    poisson : float
+        Poisson's ratio; 0.495 makes the bulk modulus a hundred times the shear modulus.
+    fibres : FibreMaterial, optional
+    stiffer : (m,) ndarray, optional
+        Factor of the shear and bulk moduli of each cell.
+    penalty : float
+        Contact pressure for each unit of depth [shear modulus / scene unit].
+
+    Attributes
+    ----------
+    rest : (N, 3) ndarray
+        Nodes, of which the first are the corners.
+
+    Raises
+    ------
+    MissingDependencyError
+        If scikit-fem is not installed.
+    """
+
+    kind, integrated = (
+        ("MeshHex", "ElementHex1"),
+        3,
+    )  # in scikit-fem, and the degree that is integrated exactly
+
+    def __init__(
+        self, points, cells, *, shear=1.0, poisson=0.495, penalty=30.0, fibres=None, stiffer=None
+    ):
+        skfem = _skfem()
+        self.shear, self.penalty = shear, penalty
+        self.fibres, self.activation = fibres, 0.0
+        self.stiffer = np.ones(len(cells)) if stiffer is None else np.asarray(stiffer, dtype=float)
+        self.bulk = 2.0 * shear * (1.0 + poisson) / (3.0 * (1.0 - 2.0 * poisson))
+        mesh, element = (getattr(skfem, name) for name in self.kind)
+        mesh = mesh(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
+        element = element()
+        basis = skfem.Basis(mesh, element, intorder=self.integrated)
+        self.mesh, self.rest = mesh, np.ascontiguousarray(basis.doflocs.T)
+        # (cell, quadrature point, node, direction): derivatives of the shape functions at rest.
+        self.slopes = np.stack([np.moveaxis(b[0].grad, 0, -1) for b in basis.basis], axis=2)
+        self.weights, self.nodes = basis.dx, basis.element_dofs.T
+        self.facets = mesh.boundary_facets()
+        self.side_cells = mesh.f2t[0, self.facets]
+        self.side_nodes = self.nodes[self.side_cells]
+        self.side_shape, self.side_weights = self._sides(skfem, element)
+        self.obstacles = ()
+        self.places = None
+
+    def _sides(self, skfem, element):
+        """Shape functions (k, 4, 8) of the cells behind the boundary's faces, at two by two Gauss
+        points of each face, and the areas (k, 4) of these.
+
+        scikit-fem looks for the points by Newton's method, which fails where two sides of a face
+        are nearly in line.
+        """
+        corners = np.asarray(element.doflocs)  # of the unit cube
+        on_face = (self.side_nodes[:, :, None] == self.surface_faces()[:, None, :]).any(axis=2)
+        shape = np.empty((len(self.facets), 4, 8))
+        area = np.empty((len(self.facets), 4))
+        gauss = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+        for axis in range(3):
+            free = [a for a in range(3) if a != axis]
+            for side in (0.0, 1.0):
+                faces = np.flatnonzero((on_face == (corners[:, axis] == side)).all(axis=1))
+                here = self.rest[self.side_nodes[faces]]
+                for q, point in enumerate(np.stack(np.meshgrid(gauss, gauss), -1).reshape(-1, 2)):
+                    local = np.full(3, side)
+                    local[free] = point
+                    parts = np.where(corners == 1.0, local, 1.0 - local)
+                    shape[faces, q] = parts.prod(axis=1)
+                    slopes = [
+                        np.where(corners[:, a] == 1.0, 1.0, -1.0)
+                        * np.delete(parts, a, axis=1).prod(axis=1)
+                        for a in free
+                    ]
+                    across = np.cross(*(np.einsum("n,fni->fi", slope, here) for slope in slopes))
+                    area[faces, q] = 0.25 * np.linalg.norm(across, axis=1)
+        return shape, area
+
+    def surface_faces(self):
+        """Corner nodes of the boundary, (k, 4) or (k, 3), in scikit-fem's order."""
+        return self.mesh.facets[:, self.facets].T
+
+    def set_obstacles(self, obstacles, attached, *, inner=False):
+        """Bones that push.
+
+        Parameters
+        ----------
+        obstacles : callable
+            ``obstacles(points)`` gives distances (n,), negative inside, and directions (n, 3).
+        attached : (n,) ndarray of bool
+            Nodes on bones; faces with any of them take no contact.
+        inner : (k,) ndarray of bool, optional
+            Faces that are no surface, as those on a plane of symmetry.
+        """
+        self.obstacles = obstacles
+        on_face = np.abs(self.side_shape).max(axis=1) > 1e-9
+        self.touching = ~((attached[self.side_nodes] & on_face).any(axis=1) | inner)
+
+    def volume(self, displacement):
+        """Volume of the deformed cells [scene unit cubed]."""
+        return float((np.linalg.det(self._gradient(displacement)) * self.weights).sum())
 
     def energy(self, displacement):
         """Elastic and contact energy; infinite where a cell is turned inside out."""
@@ -344,6 +382,14 @@ class TetSolid(HexSolid):
     """A solid of tetrahedra of ten nodes, edges straight at rest; ``cells`` (m, 4)."""
 
     kind, integrated = ("MeshTet", "ElementTetP2"), 2
+
+    def _sides(self, skfem, element):
+        """Shape functions (k, q, 10) of the cells behind the boundary's faces, at points of each
+        face, and the areas (k, q) of these.
+        """
+        side = skfem.FacetBasis(self.mesh, element, facets=self.facets, intorder=3)
+        shapes = [np.broadcast_to(np.asarray(b[0]), side.dx.shape) for b in side.basis]
+        return np.stack(shapes, axis=-1), np.abs(side.dx)
 
     def skin(self):
         """Numbers of the nodes of the boundary, those of its edges' middles among them."""
