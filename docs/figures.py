@@ -39,6 +39,7 @@ COMMANDS = {
     "known_answers": "known_answers.py",
     "phantom_solid": "fe_reference.py compare",
     "real_solids": "real_solids.py compare gluteus_maximus rectus_femoris",
+    "touching_solids": "fe_touching.py compare",
     "mesh_models": "mesh_models.py",
     "one_pose": f"one_pose.py {_FLEXION} --muscles gluteus_maximus,iliacus",
     "combined_motions": f"combined_motions.py {_FLEXION} --seeds 7 8",
