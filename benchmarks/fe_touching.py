@@ -1,9 +1,9 @@
 """Finite elements on two muscles that touch: a moving bone presses one belly into the other.
 
-    python benchmarks/fe_touching.py solve [FILE] [--levels 48,4,8 48,6,12]     the reference, a
-    small .npz file
-    python benchmarks/fe_touching.py compare [FILE] [-o FILE.json]     distance of the models from
-    it, and the contact force of RBF muscles against that of the reference
+    python benchmarks/fe_touching.py solve [FILE] [--levels 48,4,8 48,6,12] [--fibre-ratio 1.5]
+    the reference, a small .npz file
+    python benchmarks/fe_touching.py compare [-o FILE.json]     distance of the models from both
+    references that are kept, and the contact force of RBF muscles against theirs
 
 ``solve`` needs the extra ``fem`` (scikit-fem). Both bellies are symmetric about the plane y = 0,
 and one half of them is solved. What is kept are the displacements of the vertices of both meshes,
@@ -21,14 +21,18 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 from evidence import write_evidence
+from peers.fibre_material import PassiveFibres
 from peers.finite_element import HexSolid, brick_grid
 from peers.load_steps import follow, nearest_bone
 from peers.touching_solids import TouchingSolids
 from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial import cKDTree
 
 from rbfmuscle.bones.sdf import BoneSDF
 from rbfmuscle.metrics.metrics import surface_distance
 from rbfmuscle.models import build_models, configure_scene
+from rbfmuscle.muscle.muscle import RBFMuscle
+from rbfmuscle.muscle.rest import RBFOptions
 from rbfmuscle.scene.motion import bone_poses
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.frame_loop import FrameLoop
@@ -43,18 +47,23 @@ GAP = 0.2  # between the bellies, and to the moving bone [mm]
 SKIN = (40, 12, 12)  # quads of the muscles' meshes along, across and through the thickness
 # Bricks along, across one half and through the thickness: those along change the force most.
 LEVELS = ((24, 4, 8), (48, 4, 8), (96, 4, 8))
+FIBRE_NODES = 600  # of the model's solid whose fibres a reinforced solid takes
 PENALTY = 30.0  # of all contacts [shear modulus / mm]
 UNIT = 0.01  # of the kept displacements [mm]
 DATA = Path(__file__).resolve().parents[1] / "tests" / "data" / "fe_touching.npz"
-# The law of the finite elements: no fibres.
+FIBRES = DATA.with_name("fe_touching_fibres.npz")  # with fibres, by --fibre-ratio 1.5
+# The laws of both references.
 ISOTROPIC = {"model.slack_ratio": 1.0, "model.fibre_ratio": 1.0}
+REINFORCED = {"model.slack_ratio": 1.0, "model.fibre_ratio": 1.5}
 COMPARED = (
-    ("rbf", "rbf", {}),
-    ("rbf, isotropic", "rbf", ISOTROPIC),
-    ("rbf, isotropic, 150 nodes", "rbf", {**ISOTROPIC, "model.nodes": 150}),
-    ("rbf, isotropic, 600 nodes", "rbf", {**ISOTROPIC, "model.nodes": 600}),
-    ("pbd", "pbd", {}),
-    ("pbd-converged", "pbd-converged", {}),
+    ("rbf", "rbf", {}, DATA),
+    ("rbf, isotropic", "rbf", ISOTROPIC, DATA),
+    ("rbf, isotropic, 150 nodes", "rbf", {**ISOTROPIC, "model.nodes": 150}, DATA),
+    ("rbf, isotropic, 600 nodes", "rbf", {**ISOTROPIC, "model.nodes": 600}, DATA),
+    ("pbd", "pbd", {}, DATA),
+    ("pbd-converged", "pbd-converged", {}, DATA),
+    ("rbf (reference with fibres)", "rbf", {}, FIBRES),
+    ("rbf, no slack (reference with fibres)", "rbf", REINFORCED, FIBRES),
 )
 
 
@@ -163,7 +172,7 @@ class Result(NamedTuple):
 class Course:
     """Both solids on the way of the moving bone."""
 
-    def __init__(self, cells):
+    def __init__(self, cells, ratio=1.0):
         self.scene = touching_scene()
         self.cells = cells
         self.cube, bricks = brick_grid(cells)
@@ -173,8 +182,13 @@ class Course:
         end, plane = np.abs(self.cube[:, 0]) == 1.0, self.cube[:, 1] == 0.0
         solids = []
         inner = []
-        for belly in BELLIES.values():
-            solid = HexSolid(belly.points(self.cube), bricks, penalty=PENALTY)
+        for name, belly in BELLIES.items():
+            rest = belly.points(self.cube)
+            fibres = None
+            if ratio > 1.0:
+                direction = model_fibres(self.scene, name, rest[bricks].mean(axis=1))
+                fibres = PassiveFibres.of_ratio(direction, ratio)
+            solid = HexSolid(rest, bricks, penalty=PENALTY, fibres=fibres)
             hidden = plane[solid.surface_faces()].all(axis=1)
             solid.set_obstacles(self._distance, end, inner=hidden)
             solids.append(solid)
@@ -238,12 +252,19 @@ class Course:
         return float(max(between)), float(max(bone))
 
 
-def solve(path, levels):
+def model_fibres(scene, name, points):
+    """Unit directions (n, 3) of the RBF model's own fibres at points of a muscle at rest."""
+    options = RBFOptions(nodes=FIBRE_NODES, fibre_ratio=2.0)
+    solid = RBFMuscle(scene.muscle(name), scene, options).model
+    return solid.fibres.direction[cKDTree(solid.cells.points).query(points)[1]]
+
+
+def solve(path, levels, ratio=1.0):
     """Run the reference on each level, coarse to fine, and keep the finest so far."""
     found = []
     for cells in levels:
         start = time.perf_counter()
-        course = Course(cells)
+        course = Course(cells, ratio)
         print(f"{cells}: {len(course.solids.rest)} nodes", flush=True)
         volumes = course.volumes(np.zeros_like(course.solids.rest))
         rows = []
@@ -353,10 +374,10 @@ def differences(path, results):
     return found
 
 
-def rows_of(path):
+def rows_of():
     """Rows of the table, and the heads of its columns."""
     rows = []
-    for title, model, settings in COMPARED:
+    for title, model, settings, path in COMPARED:
         row = [title]
         for one in differences(path, model_results(model, settings)):
             row += [f"{rms:.2f} ({worst:.1f})" for rms, worst in (one["upper"], one["lower"])]
@@ -380,14 +401,17 @@ def level(text):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("action", choices=("solve", "compare"))
-    parser.add_argument("file", nargs="?", type=Path, default=DATA)
+    parser.add_argument("file", nargs="?", type=Path, default=DATA, help="what solve writes")
     parser.add_argument("--levels", nargs="+", type=level, default=LEVELS)
+    parser.add_argument(
+        "--fibre-ratio", type=float, default=1.0, help="Young's modulus along fibres over across"
+    )
     parser.add_argument("-o", "--output", type=Path, help="file of evidence for the pages")
     given = parser.parse_args()
     if given.action == "solve":
-        solve(given.file, given.levels)
+        solve(given.file, given.levels, given.fibre_ratio)
         return
-    rows, columns = rows_of(given.file)
+    rows, columns = rows_of()
     if given.output:
         write_evidence(given.output, ["benchmarks/fe_touching.py", "compare"], rows, columns)
 
