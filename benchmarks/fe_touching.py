@@ -111,9 +111,8 @@ class Belly:
                 flip = (side > 0) == (axis == 1)
                 quads.append(found[:, ::-1] if flip else found)
                 corners.append(face.reshape(-1, 3))
-        cube, quads = np.concatenate(corners), np.concatenate(quads)
-        cube, back = np.unique(np.round(cube, 9), axis=0, return_inverse=True)
-        quads = back.ravel()[quads]
+        cube, back = np.unique(np.round(np.concatenate(corners), 9), axis=0, return_inverse=True)
+        quads = back.ravel()[np.concatenate(quads)]
         return cube, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
@@ -179,7 +178,8 @@ class Course:
         self.cube[:, 1] = 0.5 * (self.cube[:, 1] + 1.0)
         self.bar = BoneSDF.from_mesh(self.scene.bone("bar").mesh)
         self.pose = bone_poses(self.scene, {})
-        end, plane = np.abs(self.cube[:, 0]) == 1.0, self.cube[:, 1] == 0.0
+        end = np.abs(self.cube[:, 0]) == 1.0
+        plane = self.cube[:, 1] == 0.0
         solids = []
         inner = []
         for name, belly in BELLIES.items():
@@ -239,10 +239,10 @@ class Course:
         centre (3,) of the contact force.
         """
         places, size, push = self.solids.forces(displacement)
-        force, push, centre = size.sum(), push.sum(axis=0), size @ places / size.sum()
         mirrored = np.array([1.0, 0.0, 1.0])
         scale = 2.0 / (2.0 * self.solids.shear)  # two halves, over 2 mu
-        return scale * force, scale * push * mirrored, centre * mirrored
+        centre = size @ places / size.sum()
+        return scale * size.sum(), scale * push.sum(axis=0) * mirrored, centre * mirrored
 
     def deepest(self, displacement):
         """Greatest depth of a point of one muscle in the other, and in the bone [mm]."""

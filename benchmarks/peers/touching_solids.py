@@ -107,7 +107,8 @@ class TouchingSolids(Equilibrium):
 
     def _overlap(self, one, other, here):
         """The `Overlaps` of one solid's points in the other, where nodes are ``here``."""
-        nodes, share = self.own[one], self.share[one]
+        nodes = self.own[one]
+        share = self.share[one]
         points = np.einsum("fqn,fni->fqi", share, here[nodes])
         face, spot = np.divmod(np.arange(points.shape[0] * points.shape[1]), points.shape[1])
         points = points.reshape(-1, 3)
@@ -151,7 +152,8 @@ class TouchingSolids(Equilibrium):
             index, push, stiffness = self._press(found, here, positive)
             force += np.bincount(index.ravel(), push.ravel(), len(force))
             width = index.shape[1]
-            rows, columns = np.repeat(index, width, axis=1), np.tile(index, width)
+            rows = np.repeat(index, width, axis=1)
+            columns = np.tile(index, width)
             entries = stiffness.ravel(), (rows.ravel(), columns.ravel())
             matrix = matrix + sparse.csr_array(entries, shape=matrix.shape)
         return force, sparse.csr_array(matrix)
@@ -164,7 +166,7 @@ class TouchingSolids(Equilibrium):
         shape, slopes, twist = _bilinear(found.place)
         tangent = np.einsum("mac,mci->mai", slopes, corners)
         mixed = np.einsum("c,mci->mi", twist, corners)
-        g, n = found.gap, found.normal
+        n = found.normal
 
         def rows(own, other, vector):
             """(m, 24) of what a motion of the nodes does along a vector."""
@@ -182,7 +184,7 @@ class TouchingSolids(Equilibrium):
             metric = np.einsum("mai,mbi->mab", tangent, tangent)
             bend = np.zeros_like(metric)
             bend[:, 0, 1] = bend[:, 1, 0] = np.einsum("mi,mi->m", mixed, n)
-            depth = g[:, None, None]
+            depth = found.gap[:, None, None]
             sliding = np.linalg.solve(metric - depth * bend, slide + depth * turn)
             turned = turn + bend @ sliding
             cross = np.swapaxes(turn, 1, 2) @ sliding
@@ -192,14 +194,15 @@ class TouchingSolids(Equilibrium):
             stiffness = stiffness + depth * second
         nodes = np.concatenate([found.own, found.other], axis=1)
         index = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), 24)
-        return index, (weight * g)[:, None] * along, weight[:, None, None] * stiffness
+        return index, (weight * found.gap)[:, None] * along, weight[:, None, None] * stiffness
 
 
 def _faces(solid, outer):
     """Nodes (f, 4) of the outer faces and their shape functions (f, q, 4); and the nodes again, in
     order around each face and outward.
     """
-    shape, nodes = solid.side_shape[outer], solid.side_nodes[outer]
+    shape = solid.side_shape[outer]
+    nodes = solid.side_nodes[outer]
     on_face = np.sort(np.argsort(-np.abs(shape).max(axis=1), axis=1)[:, :4], axis=1)
     own = np.take_along_axis(nodes, on_face, axis=1)
     share = np.take_along_axis(shape, on_face[:, None, :], axis=2)
