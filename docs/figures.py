@@ -41,7 +41,7 @@ COMMANDS = {
     "real_solids": "real_solids.py compare gluteus_maximus rectus_femoris",
     "touching_solids": "fe_touching.py compare",
     "mesh_models": "mesh_models.py",
-    "one_pose": f"one_pose.py {_FLEXION} --muscles gluteus_maximus,iliacus",
+    "one_pose": f"one_pose.py {_FLEXION}",
     "combined_motions": f"combined_motions.py {_FLEXION} --seeds 7 8",
     "bone_fields": "bench_sdf.py --data DATA --bones femur",
     "kernels": "kernel_table.py DATA --kernels cubic,quintic,gaussian,wendland_c4 --centres 300",
