@@ -150,7 +150,6 @@ class MotionInfo(Part):
     """
 
     frames: int = 0
-
     times: list[float] | None = None
     whole: int | None = None  # None of earlier versions
 

@@ -159,7 +159,7 @@ class TendonEnd:
         the bones. ``others`` are ends that may touch it.
         """
         ends = self._joined(others)
-        carrying = self if len(ends) == 1 else common_end(ends)
+        carrying = self if len(ends) == 1 else _common_end(ends)
         turn, shift, strain, passed = carrying._carry(poses)
         middle = turn @ self.middle + shift
         length = self.length * (1.0 + strain)
@@ -281,7 +281,7 @@ class TendonEnd:
 
 
 @lru_cache(maxsize=64)
-def common_end(ends: tuple[TendonEnd, ...]) -> TendonEnd:
+def _common_end(ends: tuple[TendonEnd, ...]) -> TendonEnd:
     """One end in place of some that touch each other, on the mean of their strings."""
     areas = np.array([end.radii[0] ** 2 for end in ends])
 

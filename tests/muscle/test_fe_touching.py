@@ -128,7 +128,7 @@ def test_two_round_bodies_press_each_other_as_hertz_says():
         (study.FIBRES, {}, 0.10),
         # Measured 0.29, above the requirement: the reference has no fibres, which resist stretch
         # here and add 25 % to the force.
-        (study.DATA, {}, 0.40),
+        (study.DATA, {}, 0.33),
     ],
 )
 def test_muscles_that_touch_lie_near_finite_elements(file, settings, force):

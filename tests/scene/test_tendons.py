@@ -307,9 +307,10 @@ def test_ends_that_touch_each_other_stay_side_by_side_where_a_bone_lifts_one():
         poses = Poses(bones, {end.name: end for end in order})
         shifts = [poses[end.name][0, 3] for end in ends]
         np.testing.assert_allclose(shifts, [3.0, 3.0, 0.0], atol=1e-6)
-        for name, end_ in zip(poses.tendons, order):
-            assert poses.tendons[name].settled
-            assert line_length(poses.tendons[name].points) == pytest.approx(end_.length, rel=1e-6)
+        for tendon_end in ends:
+            tendon = poses.tendons[tendon_end.name]
+            assert tendon.settled
+            assert line_length(tendon.points) == pytest.approx(tendon_end.length, rel=1e-6)
 
 
 def test_an_end_goes_straight_to_its_via_point_when_a_corner_of_bone_comes_before_it(leg_data):
