@@ -3,16 +3,14 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy.sparse import csr_matrix
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
+from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.geometry.surfaces import mesh_volume
 from rbfmuscle.implicit.field import SMALL, FieldFit, overlapping_parts
 from rbfmuscle.implicit.kernels import get_kernel
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
-from rbfmuscle.surface.display import neighbour_lists
 from rbfmuscle.surface.finish import fill_material, finish
 from rbfmuscle.surface.projection import MovingField, reach_level
 from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones
@@ -45,20 +43,8 @@ class Drawn:
         self.field = MovingField(FieldFit(get_kernel("cubic"), 1.0), PARTS, CENTRES, CENTRES)
         weights = self.field.weights(X)
         value, gradient = self.field(X, weights)
-        start, other = neighbour_lists(FACES, len(X))
-        self.shown = Shown(
-            X,
-            FACES,
-            csr_matrix((np.ones(len(other)), other, start), (len(X), len(X))),
-            np.diff(start).astype(float),
-            FaceTree(X, FACES),
-            weights,
-            value,
-            np.linalg.norm(gradient, axis=1),
-            np.full(len(X), 1.3 * EDGE),
-            volume,
-            EDGE,
-        )
+        slope = np.linalg.norm(gradient, axis=1)
+        self.shown = Shown.of(X, FACES, volume, weights=weights, offset=value, slope=slope)
         self.forget()
 
     def forget(self):

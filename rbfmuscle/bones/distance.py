@@ -25,7 +25,7 @@ from rbfmuscle.geometry.exact_distance import (
     offset_in_frame,
     record_square,
 )
-from rbfmuscle.geometry.frames import dot, local_point, minus, row_of
+from rbfmuscle.geometry.frames import dot, local_point, minus, row_of, turned
 from rbfmuscle.geometry.mesh_distance import half_solid_angle
 from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.loops import loop
@@ -261,11 +261,31 @@ def distance_loop(bone, pose, points, reach, anchor, bound, triangle, distance, 
             distance[i] = least
             gradient[i] = 0.0
             continue
-        d, gx, gy, gz, best = distance_at(bone, *local, triangle[i], stack, squares)
-        distance[i] = d
-        for k in range(3):
-            gradient[i, k] = dot(row_of(pose, k), (gx, gy, gz))
-            anchor[i, k] = local[k]
-        triangle[i] = best
-        # The sign of an open mesh may change without a zero between.
-        bound[i] = d if len(bone.dipoles) == 0 else -np.inf
+        known = anchor, bound, triangle
+        distance[i], way = ask(bone, local, known, i, stack, squares)
+        gradient[i, 0], gradient[i, 1], gradient[i, 2] = turned(pose, way)
+
+
+@loop
+def ask(bone, local, known, i, stack, squares):
+    """Signed distance of one point in bone coordinates and its unit gradient; row i of the arrays
+    of a `Memory` is brought up to date.
+    """
+    anchor, bound, triangle = known
+    d, gx, gy, gz, best = distance_at(bone, *local, triangle[i], stack, squares)
+    for k in range(3):
+        anchor[i, k] = local[k]
+    triangle[i] = best
+    # The sign of an open mesh may change without a zero between.
+    bound[i] = d if len(bone.dipoles) == 0 else -np.inf
+    return d, (gx, gy, gz)
+
+
+@loop
+def bound_loop(boxes, pose, points, anchor, bound, least):
+    """Fill lower bounds (n,) of the distances of points (n, 3) in the world to a bone in a pose, by
+    its boxes and the ``anchor`` and ``bound`` of a `Memory`.
+    """
+    for i in range(len(points)):
+        local = local_point(pose, row_of(points, i))
+        least[i] = least_distance(boxes, local, row_of(anchor, i), bound[i])

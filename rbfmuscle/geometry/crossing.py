@@ -3,6 +3,7 @@
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.frames import cross as cross_product
 from rbfmuscle.geometry.frames import dot, row_of
 from rbfmuscle.geometry.surfaces import corner_from, opposite_half_edges, six_volumes
 from rbfmuscle.loops import loop
@@ -35,8 +36,8 @@ class FaceTree:
     Attributes
     ----------
     faces : (m, 3) ndarray
-    closed : bool
-        Whether every edge has two triangles that agree on their outside.
+    rings : tuple of ndarray, optional
+        `vertex_rings`, of a closed mesh: every edge has two triangles that agree on their outside.
     """
 
     def __init__(self, vertices: Floats, faces: Integers) -> None:
@@ -49,8 +50,8 @@ class FaceTree:
         self._leaves = 1 << max(int(np.ceil(len(self.faces) / LEAF)) - 1, 0).bit_length()
         self._boxes: tuple[Floats, Floats] | None = None
         opposite = opposite_half_edges(self.faces)
-        self.closed = bool((opposite >= 0).all())
-        self._rings = vertex_rings(self.faces, opposite, len(vertices)) if self.closed else None
+        closed = (opposite >= 0).all()
+        self.rings = vertex_rings(self.faces, opposite, len(vertices)) if closed else None
 
     def crossing(self, vertices: Floats) -> Booleans:
         """Which triangles cross others, as `crossing_faces` says, for places of the vertices (n, 3)
@@ -70,21 +71,21 @@ class FaceTree:
     ) -> Integers:
         """Pairs of triangles (k, 2) that cross.
 
-        With ``among`` (m,) only those with one of these or, with ``folds``, with one at a corner
-        whose triangles do not lie side by side. ``again`` says that none but these moved since the
-        last call, whose other boxes are still right.
+        With ``among`` (n,) only those of a triangle with one of these corners or, with ``folds``,
+        one whose triangles do not lie side by side. ``again`` says that no other vertices moved
+        since the last call, whose other boxes are still right.
         """
         vertices = np.ascontiguousarray(vertices, dtype=np.float64)
-        asked = np.zeros(LEAF * self._leaves, dtype=np.bool_)
-        asked[: len(self.faces)] = True if among is None else among[self._order]
+        marked = np.ones(len(vertices), dtype=np.bool_) if among is None else among
         plain = np.zeros(len(vertices), dtype=np.bool_)
-        folds &= self.closed
-        if folds and self._rings is not None:
-            plain_loop(vertices, *self._rings, plain)
-        wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
-        # Without a folded corner and without triangles that are asked for no box is made.
-        if not _asked_loop(self._corners, plain, folds, asked, wanted):
+        if folds and self.rings is not None:
+            plain_loop(vertices, *self.rings, plain)
+            marked = marked | ~plain
+        if not marked.any():
             return np.zeros((0, 2), dtype=np.int64)
+        asked = np.zeros(LEAF * self._leaves, dtype=np.bool_)
+        wanted = np.zeros(2 * self._leaves, dtype=np.bool_)
+        _asked_loop(self._corners, marked, asked, wanted)
         whole = self._boxes is None or not again
         if self._boxes is None:
             self._boxes = np.empty((self._leaves, 6, LEAF)), np.empty((2 * self._leaves, 6))
@@ -118,18 +119,14 @@ def crossing_faces(vertices: Floats, faces: Integers) -> Booleans:
 
 
 @loop
-def _asked_loop(faces, plain, folds, asked, wanted):
-    """Mark, with ``folds``, also the triangles that have a corner which is not plain (n,); mark the
-    leaves of a tree that hold one which is ``asked`` for, and say whether there is one.
+def _asked_loop(faces, marked, asked, wanted):
+    """Mark the triangles that have a ``marked`` (n,) corner, which are asked for, and the leaves of
+    a tree that hold one.
     """
     leaves = len(wanted) // 2
-    some = False
     for f in range(len(faces)):
-        if folds:
-            asked[f] |= not (plain[faces[f, 0]] & plain[faces[f, 1]] & plain[faces[f, 2]])
+        asked[f] = marked[faces[f, 0]] | marked[faces[f, 1]] | marked[faces[f, 2]]
         wanted[leaves + f // LEAF] |= asked[f]
-        some |= asked[f]
-    return some
 
 
 @loop
@@ -372,44 +369,50 @@ def plain_loop(vertices, start, other, plain):
     most = 0
     for v in range(len(plain)):
         most = max(most, start[v + 1] - start[v])
-    sides, normals = np.empty((most + 1, 3)), np.empty((most, 3))
+    sides, normals = np.empty((3, most)), np.empty((3, most))
     for v in range(len(plain)):
-        count = start[v + 1] - start[v]
-        for k in range(count):
-            n = other[start[v] + k]
-            for a in range(3):
-                sides[k, a] = vertices[n, a] - vertices[v, a]
-        for a in range(3):
-            sides[count, a] = sides[0, a]
-        plain[v] = count > 0 and _side_by_side(sides, normals, count)
+        plain[v] = start[v] < start[v + 1] and _side_by_side(
+            vertices, v, other[start[v] : start[v + 1]], sides, normals
+        )
 
 
 @loop
-def _side_by_side(sides, normals, count):
-    """Whether a ring of triangles between some sides, of which the last is the first again, goes
-    round once, all seen from outside.
+def _side_by_side(vertices, v, ring, sides, normals):
+    """Whether the triangles between a vertex and the ring around it go round once, all seen from
+    outside; ``sides`` and ``normals`` are arrays to work in.
     """
     x = 0.0
     y = 0.0
     z = 0.0
-    for k in range(count):
-        normals[k, 0] = sides[k, 1] * sides[k + 1, 2] - sides[k, 2] * sides[k + 1, 1]
-        normals[k, 1] = sides[k, 2] * sides[k + 1, 0] - sides[k, 0] * sides[k + 1, 2]
-        normals[k, 2] = sides[k, 0] * sides[k + 1, 1] - sides[k, 1] * sides[k + 1, 0]
-        x += normals[k, 0]
-        y += normals[k, 1]
-        z += normals[k, 2]
+    at = row_of(vertices, v)
+    last = corner_from(vertices, ring[-1], at)
+    side = last
+    for k in range(len(ring)):
+        before = side
+        side = corner_from(vertices, ring[k], at)
+        normal = cross_product(before, side)
+        x += normal[0]
+        y += normal[1]
+        z += normal[2]
+        for a in range(3):
+            sides[a, k] = side[a]
+            normals[a, k] = normal[a]
     # A vector at a right angle to the mean normal: the ring goes from below to above it once.
     least = min(abs(x), abs(y), abs(z))
-    u, v, w = (0.0, z, -y) if abs(x) == least else ((-z, 0.0, x) if abs(y) == least else (y, -x, 0))
+    across = y, -x, 0.0
+    if abs(x) == least:
+        across = 0.0, z, -y
+    elif abs(y) == least:
+        across = -z, 0.0, x
     square = 1e-12 * (x * x + y * y + z * z)
-    turns, outside = 0, True
-    above = u * sides[0, 0] + v * sides[0, 1] + w * sides[0, 2] >= 0.0
-    for k in range(count):
-        normal = row_of(normals, k)
+    turns = 0
+    outside = True
+    above = dot(across, last) >= 0.0
+    for k in range(len(ring)):
+        normal = normals[0, k], normals[1, k], normals[2, k]
         along = dot(normal, (x, y, z))
         outside &= (along > 0.0) & (along * along > square * dot(normal, normal))
         below = not above
-        above = u * sides[k + 1, 0] + v * sides[k + 1, 1] + w * sides[k + 1, 2] >= 0.0
+        above = dot(across, (sides[0, k], sides[1, k], sides[2, k])) >= 0.0
         turns += below & above
     return outside & (turns == 1)

@@ -386,6 +386,20 @@ def record_square(records, n, x, y, z):
 
 
 @loop
+def rectangle_square(records, n, x, y, z):
+    """Squared distance from a point to the rectangle around the triangle of record n: a lower bound
+    without branches.
+    """
+    away = x - records[n, 0], y - records[n, 1], z - records[n, 2]
+    u = dot(away, (records[n, 3], records[n, 4], records[n, 5]))
+    v = dot(away, (records[n, 6], records[n, 7], records[n, 8]))
+    w = dot(away, (records[n, 9], records[n, 10], records[n, 11]))
+    du = max(-u, u - records[n, BX], 0.0)
+    dv = max(-v, v - records[n, CY], 0.0)
+    return du * du + dv * dv + w * w
+
+
+@loop
 def offset_in_frame(records, n, x, y, z):
     """Place of a point in the frame of the triangle of record n, in its plane; the way to the point
     from the nearest place of the triangle; and the feature that this lies in.
@@ -435,6 +449,9 @@ def nearest_triangle(tree, at, best, square, slack, stack):
             top += 2
             continue
         for n in range(starts[node - leaves], starts[node - leaves + 1]):
+            # Most triangles are too far away to be looked at closely.
+            if rectangle_square(records, n, x, y, z) > square * (1.0 + slack):
+                continue
             d = record_square(records, n, x, y, z)
             if d < square * (1.0 - slack):
                 best, square = n, d

@@ -92,6 +92,12 @@ def local_point(pose, point):
 
 
 @loop
+def turned(pose, vector):
+    """A vector of three numbers, turned by a pose (4, 4)."""
+    return dot(row_of(pose, 0), vector), dot(row_of(pose, 1), vector), dot(row_of(pose, 2), vector)
+
+
+@loop
 def turn_towards(m, q):
     """The unit quaternion q a step nearer to the rotational part of a matrix m, given as rows.
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, to_world
-from rbfmuscle.geometry.frames import cross, dot, minus, row_of
-from rbfmuscle.geometry.surfaces import corner_from, triangle_plane
+from rbfmuscle.geometry.frames import cross, dot, local_point, minus, row_of
+from rbfmuscle.geometry.surfaces import triangle_plane
 from rbfmuscle.loops import loop
 
 # A chord is never farther from its surface than this share of a cell. As vertices move while points
@@ -69,7 +69,7 @@ def push_off(
     pose: Floats,
     edge: float,
     moved: Booleans,
-    among: Booleans | None = None,
+    some: Integers | None = None,
 ) -> None:
     """Move the vertices (n, 3) of triangles (m, 3) that points in a pose (4, 4) have come
     through, into the surface, and mark them.
@@ -78,12 +78,12 @@ def push_off(
     length of an edge [scene unit], moves its three corners along the normal, by barycentric
     weights, until it is not. The way fades to zero where a point is at first as deep as ``CHORD``
     of that, or of the triangle's longest edge where that is shorter: what is deeper is behind
-    another part of the muscle. With ``among`` (n,) only triangles with a corner in it.
+    another part of the muscle. With ``some`` (k,) only these triangles.
     """
-    if among is None:
-        among = np.ones(len(vertices), dtype=np.bool_)
-    given = vertices, faces, among, pose, grid
-    pairs = np.empty((len(faces), 2), dtype=np.int64)
+    if some is None:
+        some = np.arange(len(faces))
+    given = vertices, faces, some, pose, grid
+    pairs = np.empty((2 * len(some), 2), dtype=np.int64)
     met = _near_loop(*given, pairs)
     if met > len(pairs):
         pairs = np.empty((met, 2), dtype=np.int64)
@@ -115,36 +115,36 @@ def _length(vertices, faces, f):
 
 
 @loop
-def _near_loop(vertices, faces, among, pose, grid, pairs):
-    """Pairs of a point and a triangle with a corner in ``among`` (n,) near it; how many there are,
-    also beyond what ``pairs`` (k, 2) holds.
+def _near_loop(vertices, faces, some, pose, grid, pairs):
+    """Pairs of a point and one of some triangles near it; how many there are, also beyond what
+    ``pairs`` (k, 2) holds.
     """
     points, start, low, edge, shape, _ = grid
-    shift = pose[0, 3], pose[1, 3], pose[2, 3]
-    corners, corner = np.empty((3, 3)), np.arange(3).reshape(1, 3)
-    least, most = np.empty(3), np.empty(3)
+    least = np.empty(3)
+    most = np.empty(3)
     begin = np.empty(3, np.int64)
     end = np.empty(3, np.int64)
     met = 0
-    for f in range(len(faces)):
-        if not (among[faces[f, 0]] or among[faces[f, 1]] or among[faces[f, 2]]):
-            continue
-        for k in range(3):
-            way = corner_from(vertices, faces[f, k], shift)
-            for a in range(3):
-                corners[k, a] = dot(way, (pose[0, a], pose[1, a], pose[2, a]))
-        margin = MARGIN * _length(corners, corner, 0)
+    for f in some:
+        a = local_point(pose, row_of(vertices, faces[f, 0]))
+        b = local_point(pose, row_of(vertices, faces[f, 1]))
+        c = local_point(pose, row_of(vertices, faces[f, 2]))
+        to_b = minus(b, a)
+        to_c = minus(c, a)
+        across = minus(c, b)
+        margin = MARGIN * np.sqrt(max(dot(to_b, to_b), dot(to_c, to_c), dot(across, across)))
         inside = True
-        for a in range(3):
-            least[a] = min(corners[0, a], corners[1, a], corners[2, a]) - margin
-            most[a] = max(corners[0, a], corners[1, a], corners[2, a]) + margin
-            inside &= most[a] >= low[a] and least[a] <= low[a] + edge * shape[a]
-            begin[a] = np.int64(max(np.floor((least[a] - low[a]) / edge), 0.0))
-            end[a] = min(np.int64(np.floor((most[a] - low[a]) / edge)), shape[a] - 1)
+        for k in range(3):
+            least[k] = min(a[k], b[k], c[k]) - margin
+            most[k] = max(a[k], b[k], c[k]) + margin
+            inside &= most[k] >= low[k] and least[k] <= low[k] + edge * shape[k]
+            begin[k] = np.int64(max(np.floor((least[k] - low[k]) / edge), 0.0))
+            end[k] = min(np.int64(np.floor((most[k] - low[k]) / edge)), shape[k] - 1)
         if not inside:
             continue
-        plane = triangle_plane(corners, corner, 0)
-        square = dot(plane[3], plane[3])
+        normal = cross(to_b, to_c)
+        plane = a, to_b, to_c, normal
+        square = dot(normal, normal)
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
-from rbfmuscle.geometry.frames import cross, dot, minus, row_of
+from rbfmuscle.geometry.frames import cross, divided, dot, minus, plus, row_of
 from rbfmuscle.loops import loop
 
 if TYPE_CHECKING:
@@ -47,6 +47,24 @@ def _vertex_normal_loop(vertices, faces, normals):
         length = max(np.sqrt(dot(total, total)), 1e-300)
         for k in range(3):
             normals[v, k] /= length
+
+
+def faces_around(faces: Integers, count: int) -> tuple[Integers, Integers]:
+    """Faces around each of ``count`` vertices: those of vertex v are ``face[start[v] : start[v +
+    1]]``.
+    """
+    order = np.argsort(faces.ravel(), kind="stable")
+    return np.searchsorted(faces.ravel()[order], np.arange(count + 1)), order // 3
+
+
+@loop
+def normal_at(vertices, faces, around, v):
+    """One of `vertex_normals`, with the faces ``around`` the vertices (`faces_around`)."""
+    start, face = around
+    total = 0.0, 0.0, 0.0
+    for n in range(start[v], start[v + 1]):
+        total = plus(total, triangle_plane(vertices, faces, face[n])[3])
+    return divided(total, max(np.sqrt(dot(total, total)), 1e-300))
 
 
 @loop

@@ -347,5 +347,5 @@ class SurfaceForm:
     @property
     def simple(self) -> bool:
         """Whether the last surface was one closed piece that nowhere crosses itself."""
-        closed = self._tree is not None and self._tree.closed
+        closed = self._tree is not None and self._tree.rings is not None
         return closed and self._found["components"] == 1 and not self._found["self_crossings"]

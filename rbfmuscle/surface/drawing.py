@@ -7,11 +7,9 @@ from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from rbfmuscle.geometry.arrays import Floats, Integers
-from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.point_grid import PointGrid
 from rbfmuscle.implicit.extraction import extract_surface
 from rbfmuscle.implicit.field import FieldFit
@@ -19,7 +17,7 @@ from rbfmuscle.scene.objects import Muscle
 from rbfmuscle.scene.scene import Scene
 from rbfmuscle.simulation.contact import BoneContacts
 from rbfmuscle.simulation.frame import ModelSurface
-from rbfmuscle.surface.display import display_mesh, neighbour_lists
+from rbfmuscle.surface.display import display_mesh
 from rbfmuscle.surface.finish import MeetingSheets, clear_rest, fill_material, finish
 from rbfmuscle.surface.projection import UNSURE, MovingField, reach_level
 from rbfmuscle.surface.sheet import Sheet, Shown, ShownBones
@@ -100,22 +98,8 @@ class SurfaceBuilder:
             slope = np.linalg.norm(gradient, axis=1)
             # A field that is flat between its centres is none of the surface.
             weights = weights if np.median(slope) >= UNSURE else None
-        sides = _lengths(vertices, faces)
-        longest = np.zeros(len(vertices))
-        np.maximum.at(longest, faces.ravel(), np.repeat(sides.max(axis=1), 3))
-        start, other = neighbour_lists(faces, len(vertices))
-        self.shown = Shown(
-            vertices,
-            faces,
-            csr_matrix((np.ones(len(other)), other, start), (len(vertices),) * 2),
-            np.diff(start).astype(np.float64),
-            FaceTree(vertices, faces),
-            weights,
-            offset,
-            slope,
-            longest,
-            self.rest.volume,
-            float(sides.mean()),
+        self.shown = Shown.of(
+            vertices, faces, self.rest.volume, weights=weights, offset=offset, slope=slope
         )
         self._meeting = MeetingSheets(self.rest.centres, vertices)
         self.carry = self._embed(vertices)

@@ -50,7 +50,7 @@ def part_crossings(
     """
     before = sheet.vertices.copy()
     moved = np.zeros(len(before), dtype=np.bool_)
-    among, pairs = shown.touching(sheet.suspect), np.zeros((0, 2), dtype=np.int64)
+    among, pairs = sheet.suspect, np.zeros((0, 2), dtype=np.int64)
     for turn in range(ROUNDS + 1):
         pairs = shown.tree.pairs(sheet.vertices, among, folds=folds and turn == 0, again=turn > 0)
         if len(pairs) == 0 or turn == ROUNDS:
@@ -67,10 +67,9 @@ def part_crossings(
             means = shown.links[rows] @ sheet.vertices / shown.degree[rows, None]
             sheet.vertices[rows] = 0.5 * (sheet.vertices[rows] + means)
         bones.lift(sheet, rows)
-        here = np.zeros(len(moved), dtype=np.bool_)
-        here[rows] = True
-        moved |= here
-        among = shown.touching(here)
+        among = np.zeros(len(moved), dtype=np.bool_)
+        among[rows] = True
+        moved |= among
     return moved, len(np.unique(pairs))
 
 

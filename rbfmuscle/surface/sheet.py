@@ -3,18 +3,31 @@ that they are kept out of.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from rbfmuscle.bones.distance import BoneArrays, Memory, distances
+from rbfmuscle.bones.distance import (
+    BoneArrays,
+    Memory,
+    ask,
+    bound_loop,
+    distances,
+    least_distance,
+)
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
+from rbfmuscle.geometry.exact_distance import STACK
+from rbfmuscle.geometry.frames import dot, local_point, row_of
 from rbfmuscle.geometry.point_grid import PointGrid, push_off
-from rbfmuscle.geometry.surfaces import vertex_normals
+from rbfmuscle.geometry.surfaces import faces_around, normal_at
+from rbfmuscle.geometry.threads import in_chunks
 from rbfmuscle.implicit.evaluation import Blend
+from rbfmuscle.loops import loop
 from rbfmuscle.simulation.contact import BonesInReach
+from rbfmuscle.surface.display import neighbour_lists
 
 # Rings of vertices on which a displacement fades, by so much on each.
 RINGS, FADE = 3, 0.6
@@ -27,6 +40,7 @@ class Shown(NamedTuple):
     faces: Integers  # (m, 3)
     links: csr_matrix  # (n, n) 1 between neighbours
     degree: Floats  # (n,) how many neighbours a vertex has
+    around: tuple[Integers, Integers]  # the faces around each vertex, as `faces_around` has them
     tree: FaceTree
     weights: Blend | None  # of the local fits at the vertices, None without a field
     offset: Floats  # (n,) level offset, the field's value at rest
@@ -35,11 +49,43 @@ class Shown(NamedTuple):
     volume: float  # at rest [scene unit cubed]
     edge: float  # mean length of an edge at rest [scene unit]
 
-    def touching(self, marked: Booleans) -> Booleans:
-        """Which triangles (m,) have a marked corner."""
-        one, two, three = self.faces.T
-        found: Booleans = marked[one] | marked[two] | marked[three]
-        return found
+    @classmethod
+    def of(
+        cls,
+        rest: Floats,
+        faces: Integers,
+        volume: float,
+        *,
+        weights: Blend | None,
+        offset: Floats,
+        slope: Floats,
+    ) -> "Shown":
+        """A mesh, and what its field is at rest."""
+        count = len(rest)
+        start, other = neighbour_lists(faces, count)
+        sides = np.linalg.norm(rest[faces] - rest[np.roll(faces, 1, axis=1)], axis=2)
+        longest = np.zeros(count)
+        np.maximum.at(longest, faces.ravel(), np.repeat(sides.max(axis=1), 3))
+        return cls(
+            rest,
+            faces,
+            csr_matrix((np.ones(len(other)), other, start), (count, count)),
+            np.diff(start).astype(np.float64),
+            faces_around(faces, count),
+            FaceTree(rest, faces),
+            weights,
+            offset,
+            slope,
+            longest,
+            volume,
+            float(sides.mean()),
+        )
+
+    def touching(self, rows: Integers) -> Integers:
+        """Triangles with one of some vertices as a corner."""
+        found = np.zeros(len(self.faces), dtype=np.bool_)
+        _touching_loop(rows, *self.around, found)
+        return np.flatnonzero(found)
 
     def grown(self, rows: Integers) -> Integers:
         """Some vertices and their neighbours."""
@@ -60,13 +106,19 @@ class Shown(NamedTuple):
         return rows
 
 
+@loop
+def _touching_loop(rows, start, face, found):
+    for v in rows:
+        for n in range(start[v], start[v + 1]):
+            found[face[n]] = True
+
+
 class Sheet(NamedTuple):
     """A surface on its way; arrays by vertex, changed in place."""
 
     carried: Floats  # (n, 3) where the material carries the vertices
     vertices: Floats  # (n, 3)
     direction: Floats  # (n, 3) motion for a unit of level; 0 where something else holds a vertex
-    normals: Floats  # (n, 3) unit, of the carried surface; 0 until they are asked for
     bounded: Booleans  # (n,) kept from a level set that is too far away
     suspect: Booleans  # (n,) beside which triangles may cross others
 
@@ -74,8 +126,7 @@ class Sheet(NamedTuple):
     def at(cls, carried: Floats) -> "Sheet":
         """The surface where the material carries it."""
         flags = np.zeros((2, len(carried)), dtype=np.bool_)
-        nothing = np.zeros((2, *carried.shape))
-        return cls(carried, carried.copy(), nothing[0], nothing[1], flags[0], flags[1])
+        return cls(carried, carried.copy(), np.zeros_like(carried), flags[0], flags[1])
 
     def shift(self, change: float) -> None:
         """Move the vertices as the level set moves with its level, to first order."""
@@ -120,10 +171,8 @@ class ShownBones:
         self._grids = [grids[name] for name in bones.names]
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
         self._reach = NEAR_FACE * shown.side
-        # Vertices that each bone may be within reach of, and what is known of these alone.
-        nothing = np.zeros(0, dtype=np.int64)
-        self._near = [nothing for _ in bones.names]
-        self._known = [Memory.of(0) for _ in bones.names]
+        # Vertices that each bone may be within reach of.
+        self._near = [np.zeros(0, dtype=np.int64) for _ in bones.names]
 
     def find_near(self, points: Floats) -> None:
         """Find the vertices that a bone may be within reach of, where these are at points (n, 3).
@@ -131,17 +180,16 @@ class ShownBones:
         A bound of the distance is kept for each, which shrinks as the vertex moves. The bone is
         asked only where it falls below the reach, or below what it was when it was found.
         """
-        unbounded = np.full(len(points), -np.inf)
-        for bone, memory in enumerate(self._memories):
-            asked = self._bones[bone], self._poses[bone]
-            least, _ = distances(*asked, points, unbounded, memory)
+        least = np.empty(len(points))
+        for number, memory in enumerate(self._memories):
+            bone, pose = self._bones[number], self._poses[number]
+            bound_loop(bone.boxes, pose, points, memory.anchor, memory.bound, least)
             stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
             known = memory.some(stale)
-            least[stale], _ = distances(*asked, points[stale], self._reach[stale], known)
+            least[stale], _ = distances(bone, pose, points[stale], self._reach[stale], known)
             for part, values in zip(memory, known):
                 part[stale] = values
-            self._near[bone] = np.flatnonzero(least < self._reach)
-            self._known[bone] = memory.some(self._near[bone])
+            self._near[number] = np.flatnonzero(least < self._reach)
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
@@ -149,37 +197,15 @@ class ShownBones:
         Of ``rows``; without them, of those that `find_near` found. What looks away from the bone
         keeps off it, so that both sides of a muscle that sinks into it stay apart.
         """
-        moved = []
-        for bone in range(len(self._bones)):
-            if rows is None:
-                some, known = self._near[bone], self._known[bone]
-            else:
-                some, known = rows, self._memories[bone].some(rows)
-            for _ in range(LIFTS):
-                points = sheet.vertices[some]
-                distance, outward = distances(
-                    self._bones[bone], self._poses[bone], points, np.zeros(len(some)), known
-                )
-                inside = np.flatnonzero(distance < -OUT * self._shown.edge)
-                if len(inside) == 0:
-                    break
-                some, known = some[inside], known.some(inside)
-                self._move_onto(sheet, some, distance[inside], outward[inside])
-                moved.append(some)
-        return np.unique(np.concatenate(moved)) if moved else np.zeros(0, dtype=np.int64)
-
-    def _move_onto(self, sheet: Sheet, rows: Integers, distance: Floats, outward: Floats) -> None:
-        """Move vertices onto a bone that they lie in by a ``distance`` (k,) below zero, which grows
-        ``outward`` (k, 3).
-        """
-        edge = self._shown.edge
-        if not sheet.normals.any():
-            sheet.normals[:] = vertex_normals(sheet.carried, self._shown.faces)
-        away = np.einsum("ij,ij->i", sheet.normals[rows], outward)
-        height = LAMELLA * edge * np.maximum(away, 0.0) - distance
-        sheet.suspect[rows] |= distance < -SUNK * edge
-        sheet.vertices[rows] += height[:, None] * outward
-        sheet.hold(rows)
+        shown = self._shown
+        lifted = np.zeros(len(sheet.vertices), dtype=np.bool_)
+        material = sheet.carried, shown.faces, shown.around, shown.edge
+        moved = sheet.vertices, sheet.direction, sheet.suspect, lifted
+        for number, memory in enumerate(self._memories):
+            some = self._near[number] if rows is None else rows
+            given = self._bones[number], self._poses[number], *memory, *material, *moved
+            in_chunks(len(some), partial(_lift_some, some, given))
+        return np.flatnonzero(lifted)
 
     def push_off(self, sheet: Sheet, among: Booleans | None = None) -> None:
         """Move the corners of triangles that a bone's vertices came through, of those with a corner
@@ -189,10 +215,8 @@ class ShownBones:
         for _ in range(2):
             moved = np.zeros(count, dtype=np.bool_)
             for grid, pose, near in zip(self._grids, self._poses, self._near):
-                some = np.zeros(count, dtype=np.bool_)
-                some[near] = True if among is None else among[near]
-                if some.any():
-                    push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)
+                some = shown.touching(near if among is None else near[among[near]])
+                push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)
             rows = np.flatnonzero(moved)
             sheet.suspect[rows] = True
             sheet.hold(rows)
@@ -200,3 +224,51 @@ class ShownBones:
                 return
             among = np.zeros(count, dtype=np.bool_)
             among[shown.grown(rows)] = True
+
+
+def _lift_some(rows: Integers, given: tuple, start: int, stop: int) -> None:
+    _lift_loop(rows[start:stop], *given)
+
+
+@loop
+def _lift_loop(
+    rows,
+    bone,
+    pose,
+    anchor,
+    bound,
+    triangle,
+    carried,
+    faces,
+    around,
+    edge,
+    vertices,
+    direction,
+    suspect,
+    lifted,
+):
+    """Move some vertices onto a bone that they lie in, and mark them."""
+    stack = np.empty(STACK, np.int64)
+    squares = np.empty(STACK)
+    known = anchor, bound, triangle
+    out = -OUT * edge
+    for v in rows:
+        for _ in range(LIFTS):
+            local = local_point(pose, row_of(vertices, v))
+            if least_distance(bone.boxes, local, row_of(anchor, v), bound[v]) > out:
+                break
+            distance, way = ask(bone, local, known, v, stack, squares)
+            if distance >= out:
+                break
+            outward = (
+                dot(row_of(pose, 0), way),
+                dot(row_of(pose, 1), way),
+                dot(row_of(pose, 2), way),
+            )
+            away = dot(normal_at(carried, faces, around, v), outward)
+            height = LAMELLA * edge * max(away, 0.0) - distance
+            suspect[v] |= distance < -SUNK * edge
+            lifted[v] = True
+            for k in range(3):
+                vertices[v, k] += height * outward[k]
+                direction[v, k] = 0.0

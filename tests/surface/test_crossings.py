@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy.sparse import csr_matrix
 from shown_ball import EDGE, FACES, VOLUME, Drawn, X, bone
 
-from rbfmuscle.geometry.crossing import FaceTree, crossing_faces
-from rbfmuscle.surface.display import neighbour_lists
+from rbfmuscle.geometry.crossing import crossing_faces
 from rbfmuscle.surface.finish import part_crossings, rotation
-from rbfmuscle.surface.sheet import Sheet
+from rbfmuscle.surface.sheet import Sheet, Shown
 
 
 def parted(carried, shown=None):
@@ -43,16 +41,9 @@ def test_a_fold_is_found_where_nothing_is_suspect_and_parted_where_folds_are_ask
 def shown_as(vertices, faces, edge):
     """A triangle mesh as a shown surface, whose edges are about so long."""
     faces = np.asarray(faces, dtype=np.int64)
-    start, other = neighbour_lists(faces, len(vertices))
-    links = csr_matrix((np.ones(len(other)), other, start), (len(vertices),) * 2)
-    return Drawn().shown._replace(
-        rest=vertices,
-        faces=faces,
-        links=links,
-        degree=np.diff(start).astype(float),
-        tree=FaceTree(vertices, faces),
-        edge=float(edge),
-    )
+    nothing = np.zeros(len(vertices))
+    given = {"weights": None, "offset": nothing, "slope": nothing}
+    return Shown.of(vertices, faces, 1.0, **given)._replace(edge=float(edge))
 
 
 @pytest.fixture(scope="module")

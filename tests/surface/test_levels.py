@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 import trimesh
-from scipy.sparse import csr_matrix
 
 from rbfmuscle.bones.sdf import BoneSDF
-from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.point_grid import PointGrid
-from rbfmuscle.geometry.surfaces import change_to_volume, mesh_volume, vertex_normals
+from rbfmuscle.geometry.surfaces import (
+    change_to_volume,
+    mesh_volume,
+    vertex_normals,
+)
 from rbfmuscle.simulation.contact import BoneContacts, BonesInReach
-from rbfmuscle.surface.display import neighbour_lists
 from rbfmuscle.surface.finish import CUBIC, FAR, NEAR, STEPS, MeetingSheets, fill_material, finish
 from rbfmuscle.surface.projection import (
     ALWAYS,
@@ -41,21 +42,10 @@ class Ball:
         value, gradient = np.zeros(len(x)), np.zeros_like(x)
         if field is not no_field:
             value, gradient = field(x, None, np.ones(len(x), dtype=bool))
-        start, other = neighbour_lists(FACES, len(x))
-        edge = radius * float(BALL.edges_unique_length.mean())
-        self.shown = Shown(
-            x,
-            FACES,
-            csr_matrix((np.ones(len(other)), other, start), (len(x), len(x))),
-            np.diff(start).astype(float),
-            FaceTree(x, FACES),
-            object(),
-            value,
-            np.linalg.norm(gradient, axis=1),
-            np.full(len(x), 1.3 * edge),
-            mesh_volume(x, FACES),
-            edge,
-        )
+        slope = np.linalg.norm(gradient, axis=1)
+        volume = mesh_volume(x, FACES)
+        given = {"weights": object(), "offset": value, "slope": slope}
+        self.shown = Shown.of(x, FACES, volume, **given)
         names = [f"bone {k}" for k in range(len(bones))]
         fields = [BoneSDF.from_mesh(one) for one in bones]
         grids = {
