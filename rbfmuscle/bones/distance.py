@@ -282,10 +282,11 @@ def ask(bone, local, known, i, stack, squares):
 
 
 @loop
-def bound_loop(boxes, pose, points, anchor, bound, least):
-    """Fill lower bounds (n,) of the distances of points (n, 3) in the world to a bone in a pose, by
-    its boxes and the ``anchor`` and ``bound`` of a `Memory`.
+def near_loop(boxes, pose, points, rows, reach, anchor, bound, near):
+    """Mark ``near`` (k,) those of some points that a bone in a pose may be within ``reach`` (n,)
+    of, by its boxes and the ``anchor`` and ``bound`` of a `Memory` of all points (n, 3).
     """
-    for i in range(len(points)):
+    for k in range(len(rows)):
+        i = rows[k]
         local = local_point(pose, row_of(points, i))
-        least[i] = least_distance(boxes, local, row_of(anchor, i), bound[i])
+        near[k] = least_distance(boxes, local, row_of(anchor, i), bound[i]) < reach[i]

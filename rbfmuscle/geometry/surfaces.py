@@ -396,6 +396,16 @@ def farthest_move(before, after):
     return np.sqrt(most)
 
 
+@loop
+def longest(vectors):
+    """The greatest length of vectors (n, 3)."""
+    most = 0.0
+    for i in range(len(vectors)):
+        vector = row_of(vectors, i)
+        most = max(most, dot(vector, vector))
+    return np.sqrt(most)
+
+
 def surface_graph(mesh: "trimesh.Trimesh") -> csr_matrix:
     """Lengths of the edges of a mesh, and of the ways across them to the corner on the other side:
     paths along edges alone are up to 15 % too long, these some per cent.

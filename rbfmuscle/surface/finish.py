@@ -16,6 +16,7 @@ from scipy.spatial.distance import cdist
 
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, unit
 from rbfmuscle.geometry.crossing import cross
+from rbfmuscle.geometry.frames import dot, minus, row_of
 from rbfmuscle.geometry.surfaces import (
     change_to_volume,
     face_normals,
@@ -61,11 +62,8 @@ def part_crossings(
         else:
             if turn == PARTED:
                 sheet.vertices[:] = before
-            rows = np.unique(shown.faces[pairs])
-            for _ in range(1 + (turn - PARTED) // WIDER):
-                rows = shown.grown(rows)
-            means = shown.links[rows] @ sheet.vertices / shown.degree[rows, None]
-            sheet.vertices[rows] = 0.5 * (sheet.vertices[rows] + means)
+            rows = shown.grown(np.unique(shown.faces[pairs]), 1 + (turn - PARTED) // WIDER)
+            sheet.vertices[rows] = 0.5 * (sheet.vertices[rows] + shown.means(rows, sheet.vertices))
         bones.lift(sheet, rows)
         among = np.zeros(len(moved), dtype=np.bool_)
         among[rows] = True
@@ -75,21 +73,17 @@ def part_crossings(
 
 def _displacements(shown: Shown, sheet: Sheet, pairs: Integers) -> tuple[Integers, Floats]:
     """Vertices (r,) and their displacements (r, 3), which part pairs of triangles (k, 2)."""
-    links = shown.links
     parted, smoothed = np.zeros_like(sheet.vertices), np.zeros_like(sheet.vertices)
     corners = np.unique(shown.faces[pairs])
-    means = links[corners] @ sheet.vertices / shown.degree[corners, None]
     inwards = np.zeros_like(sheet.vertices)
-    inwards[corners] = means - sheet.vertices[corners]
+    inwards[corners] = shown.means(corners, sheet.vertices) - sheet.vertices[corners]
     directions = _directions(shown, sheet, pairs)
     given = sheet.vertices, shown.faces, pairs, directions, inwards, shown.edge
     _part_loop(*given, parted, smoothed)
     parted *= BEYOND
     rows = shown.spread(parted)
-    if len(rows):
-        near, degree = links[rows], shown.degree[rows, None]
-        for _ in range(SWEEPS):
-            parted[rows] = 0.5 * (parted[rows] + near @ parted / degree)
+    for _ in range(SWEEPS):
+        parted[rows] = 0.5 * (parted[rows] + shown.means(rows, parted))
     rows = np.union1d(rows, corners)
     return rows, parted[rows] + BEYOND * smoothed[rows]
 
@@ -98,14 +92,12 @@ def _directions(shown: Shown, sheet: Sheet, pairs: Integers) -> Floats:
     """Unit vectors (k, 2, 3) along which the first triangle of each pair parts from the second: by
     its place at rest, and by the normals of both where these agree with it, else that again.
     """
-    faces, links = shown.faces, shown.links
-    rows = np.unique(faces[pairs])
-    for _ in range(TURNED):
-        rows = shown.grown(rows)
+    faces = shown.faces
+    rows = shown.grown(np.unique(faces[pairs]), TURNED)
     place = np.full(len(shown.rest), -1)
     place[rows] = np.arange(len(rows))
     corners = place[faces[pairs, 0]]
-    joined = links[rows][:, rows] + coo_matrix(
+    joined = shown.graph(rows) + coo_matrix(
         (np.ones(len(pairs)), corners.T), (len(rows), len(rows))
     )
     count, label = connected_components(joined, directed=False)
@@ -292,6 +284,20 @@ class MeetingSheets:
 
     def __call__(self, centres: Floats) -> Integers:
         """The vertices, by the centres (K, 3) where they are now."""
-        near = cdist(centres, centres, "sqeuclidean") < (NEAR * self._spacing) ** 2
-        met = (near & self._far).any(axis=1)
+        met = np.zeros(len(centres), dtype=np.bool_)
+        _meet_loop(centres, self._far, (NEAR * self._spacing) ** 2, met)
         return np.flatnonzero(met[self._centre]) if met.any() else np.zeros(0, dtype=np.int64)
+
+
+@loop
+def _meet_loop(centres, far, most, met):
+    """Mark (K,) the centres (K, 3) whose squared distance from one that was ``far`` (K, K) is below
+    ``most``.
+    """
+    for i in range(len(centres)):
+        at = row_of(centres, i)
+        for j in range(i):
+            way = minus(row_of(centres, j), at)
+            if dot(way, way) < most and far[i, j]:
+                met[i] = True
+                met[j] = True

@@ -13,9 +13,8 @@ from rbfmuscle.bones.distance import (
     BoneArrays,
     Memory,
     ask,
-    bound_loop,
-    distances,
     least_distance,
+    near_loop,
 )
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
@@ -38,8 +37,7 @@ class Shown(NamedTuple):
 
     rest: Floats  # (n, 3) the vertices at rest
     faces: Integers  # (m, 3)
-    links: csr_matrix  # (n, n) 1 between neighbours
-    degree: Floats  # (n,) how many neighbours a vertex has
+    links: tuple[Integers, Integers]  # the neighbours of each vertex, as `neighbour_lists` has them
     around: tuple[Integers, Integers]  # the faces around each vertex, as `faces_around` has them
     tree: FaceTree
     weights: Blend | None  # of the local fits at the vertices, None without a field
@@ -62,15 +60,13 @@ class Shown(NamedTuple):
     ) -> "Shown":
         """A mesh, and what its field is at rest."""
         count = len(rest)
-        start, other = neighbour_lists(faces, count)
         sides = np.linalg.norm(rest[faces] - rest[np.roll(faces, 1, axis=1)], axis=2)
         longest = np.zeros(count)
         np.maximum.at(longest, faces.ravel(), np.repeat(sides.max(axis=1), 3))
         return cls(
             rest,
             faces,
-            csr_matrix((np.ones(len(other)), other, start), (count, count)),
-            np.diff(start).astype(np.float64),
+            neighbour_lists(faces, count),
             faces_around(faces, count),
             FaceTree(rest, faces),
             weights,
@@ -84,33 +80,77 @@ class Shown(NamedTuple):
     def touching(self, rows: Integers) -> Integers:
         """Triangles with one of some vertices as a corner."""
         found = np.zeros(len(self.faces), dtype=np.bool_)
-        _touching_loop(rows, *self.around, found)
+        _mark_loop(rows, *self.around, found)
         return np.flatnonzero(found)
 
-    def grown(self, rows: Integers) -> Integers:
-        """Some vertices and their neighbours."""
-        return np.union1d(rows, self.links[rows].indices)
+    def grown(self, rows: Integers, rings: int = 1) -> Integers:
+        """Some vertices and those on so many rings around them."""
+        for _ in range(rings):
+            found = np.zeros(len(self.rest), dtype=np.bool_)
+            found[rows] = True
+            _mark_loop(rows, *self.links, found)
+            rows = np.flatnonzero(found)
+        return rows
+
+    def graph(self, rows: Integers) -> csr_matrix:
+        """Sparse (k, k), 1 between neighbours of some vertices (k,)."""
+        start, other = self.links
+        place = np.full(len(self.rest), -1)
+        place[rows] = np.arange(len(rows))
+        count = start[rows + 1] - start[rows]
+        row = np.repeat(np.arange(len(rows)), count)
+        column = place[other[np.arange(len(row)) + (start[rows] - np.cumsum(count) + count)[row]]]
+        inner = column >= 0
+        ones = np.ones(int(inner.sum()))
+        return csr_matrix((ones, (row[inner], column[inner])), (len(rows), len(rows)))
+
+    def means(self, rows: Integers, values: Floats) -> Floats:
+        """Means (k, 3) of the values (n, 3) at the neighbours of some vertices (k,)."""
+        found = np.zeros((len(rows), 3))
+        everywhere = np.ones(len(values), dtype=np.bool_)
+        _mean_loop(rows, *self.links, everywhere, values, found)
+        return found
 
     def spread(self, displacement: Floats) -> Integers:
         """Let a displacement (n, 3) of some vertices fade away over rings around them; the vertices
         that it has then.
         """
         rows = np.flatnonzero(displacement.any(axis=1))
-        for _ in range(RINGS if len(rows) else 0):
-            marked = np.zeros(len(displacement))
-            marked[rows] = 1.0
-            ring = np.setdiff1d(self.links[rows].indices, rows)
-            near = self.links[ring]
-            displacement[ring] = FADE * (near @ displacement) / (near @ marked)[:, None]
-            rows = np.concatenate([rows, ring])
+        for _ in range(RINGS):
+            marked = np.zeros(len(displacement), dtype=np.bool_)
+            marked[rows] = True
+            wider = self.grown(rows)
+            ring = wider[~marked[wider]]
+            found = np.zeros((len(ring), 3))
+            _mean_loop(ring, *self.links, marked, displacement, found)
+            displacement[ring] = FADE * found
+            rows = wider
         return rows
 
 
 @loop
-def _touching_loop(rows, start, face, found):
+def _mark_loop(rows, start, other, found):
+    """Mark what belongs to some vertices, as their neighbours or triangles."""
     for v in rows:
         for n in range(start[v], start[v + 1]):
-            found[face[n]] = True
+            found[other[n]] = True
+
+
+@loop
+def _mean_loop(rows, start, other, marked, values, means):
+    """Means (k, 3) of the values (n, 3) at the neighbours, of those that are marked, of some
+    vertices (k,).
+    """
+    for k in range(len(rows)):
+        v = rows[k]
+        count = 0
+        for n in range(start[v], start[v + 1]):
+            if marked[other[n]]:
+                count += 1
+                for a in range(3):
+                    means[k, a] += values[other[n], a]
+        for a in range(3):
+            means[k, a] /= count
 
 
 class Sheet(NamedTuple):
@@ -172,24 +212,23 @@ class ShownBones:
         self._memories = [Memory.of(len(shown.rest)) for _ in bones.names]
         self._reach = NEAR_FACE * shown.side
         # Vertices that each bone may be within reach of.
-        self._near = [np.zeros(0, dtype=np.int64) for _ in bones.names]
+        self._all = np.arange(len(shown.rest))
+        self._near = [self._all for _ in bones.names]
 
     def find_near(self, points: Floats) -> None:
-        """Find the vertices that a bone may be within reach of, where these are at points (n, 3).
+        """Find the vertices that a bone may be within reach of, where they are at points (n, 3)."""
+        bones = range(len(self._bones))
+        self._near = [self._within_reach(bone, points, self._all) for bone in bones]
 
-        A bound of the distance is kept for each, which shrinks as the vertex moves. The bone is
-        asked only where it falls below the reach, or below what it was when it was found.
+    def _within_reach(self, bone: int, points: Floats, rows: Integers) -> Integers:
+        """Those of some vertices that a bone may be within reach of, by the bound of the distance
+        that is known of each, which shrinks as the vertex moves.
         """
-        least = np.empty(len(points))
-        for number, memory in enumerate(self._memories):
-            bone, pose = self._bones[number], self._poses[number]
-            bound_loop(bone.boxes, pose, points, memory.anchor, memory.bound, least)
-            stale = np.flatnonzero((least < self._reach) & (memory.bound >= self._reach))
-            known = memory.some(stale)
-            least[stale], _ = distances(bone, pose, points[stale], self._reach[stale], known)
-            for part, values in zip(memory, known):
-                part[stale] = values
-            self._near[number] = np.flatnonzero(least < self._reach)
+        boxes, memory = self._bones[bone].boxes, self._memories[bone]
+        near = np.empty(len(rows), dtype=np.bool_)
+        given = points, rows, self._reach, memory.anchor, memory.bound
+        near_loop(boxes, self._poses[bone], *given, near)
+        return rows[near]
 
     def lift(self, sheet: Sheet, rows: Integers | None = None) -> Integers:
         """Move vertices that lie in a bone onto it, where they stay: these.
@@ -214,9 +253,11 @@ class ShownBones:
         shown, count = self._shown, len(sheet.vertices)
         for _ in range(2):
             moved = np.zeros(count, dtype=np.bool_)
-            for grid, pose, near in zip(self._grids, self._poses, self._near):
-                some = shown.touching(near if among is None else near[among[near]])
-                push_off(sheet.vertices, shown.faces, grid, pose, shown.edge, moved, some)
+            for bone, near in enumerate(self._near):
+                rows = near if among is None else near[among[near]]
+                some = shown.touching(self._within_reach(bone, sheet.vertices, rows))
+                given = self._grids[bone], self._poses[bone], shown.edge
+                push_off(sheet.vertices, shown.faces, *given, moved, some)
             rows = np.flatnonzero(moved)
             sheet.suspect[rows] = True
             sheet.hold(rows)
