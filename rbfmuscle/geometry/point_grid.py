@@ -124,6 +124,7 @@ def _near_loop(vertices, faces, some, pose, grid, pairs):
     most = np.empty(3)
     begin = np.empty(3, np.int64)
     end = np.empty(3, np.int64)
+    boxed = np.empty(len(points) + 1, np.int64)
     met = 0
     for f in some:
         a = local_point(pose, row_of(vertices, faces[f, 0]))
@@ -145,13 +146,15 @@ def _near_loop(vertices, faces, some, pose, grid, pairs):
         normal = cross(to_b, to_c)
         plane = a, to_b, to_c, normal
         square = dot(normal, normal)
+        count = 0
         for i in range(begin[0], end[0] + 1):
             for j in range(begin[1], end[1] + 1):
                 row = (i * shape[1] + j) * shape[2]
                 for p in range(start[row + begin[2]], start[row + end[2] + 1]):
                     x, y, z = row_of(points, p)
-                    # Most are outside the box.
-                    boxed = (
+                    # Without a branch: which of them are in the box cannot be foreseen.
+                    boxed[count] = p
+                    count += (
                         (least[0] <= x)
                         & (x <= most[0])
                         & (least[1] <= y)
@@ -159,10 +162,12 @@ def _near_loop(vertices, faces, some, pose, grid, pairs):
                         & (least[2] <= z)
                         & (z <= most[2])
                     )
-                    if boxed and _is_near(plane, square, margin, x, y, z):
-                        if met < len(pairs):
-                            pairs[met, 0], pairs[met, 1] = p, f
-                        met += 1
+        for p in boxed[:count]:
+            x, y, z = row_of(points, p)
+            if _is_near(plane, square, margin, x, y, z):
+                if met < len(pairs):
+                    pairs[met, 0], pairs[met, 1] = p, f
+                met += 1
     return met
 
 

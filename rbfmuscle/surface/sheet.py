@@ -174,6 +174,8 @@ class Sheet(NamedTuple):
 
     def displace(self, displacement: Floats) -> None:
         """Move vertices by a displacement (n, 3), where they stay."""
+        if not displacement.any():
+            return
         rows = np.flatnonzero(displacement.any(axis=1))
         self.vertices[rows] += displacement[rows]
         self.suspect[rows] = True
