@@ -12,7 +12,7 @@ matrices and the forces on the nodes another; between them processors treat seve
 import numpy as np
 
 from rbfmuscle.geometry.arrays import Floats
-from rbfmuscle.geometry.frames import cross, dot, quaternion_matrix, turn_towards
+from rbfmuscle.geometry.frames import cross, dot, quaternion_matrix, row_of, turn_towards
 from rbfmuscle.loops import loop
 from rbfmuscle.solid.lattice import GROUPS as POINTS
 
@@ -167,23 +167,45 @@ def stress_points(work, tension):
 def pull_apart(squeezed, nodes, slopes, least, stiffness, work, right):
     """Add what pulls squeezed quadrature points (k,) to the nearest deformation G with det G of at
     least ``least`` to the forces ``right`` (N, 3); returns its energy over 2 μ.
-
-    Each round goes to the foot of the perpendicular from F on the tangent plane of det G = least,
-    the first from the rotation R of the point.
     """
     energy = 0.0
+    nearest = nearest_deformations(squeezed, least, work)
     for i in range(len(squeezed)):
         c = squeezed[i] // POINTS
         p = squeezed[i] % POINTS
         f = _matrix(work[c], GRADIENT, p)
-        if work[c, DETERMINANT * POINTS + p] >= least:
-            g = f
-        else:
+        weight = stiffness * work[c, WEIGHT * POINTS + p]
+        for a in range(3):
+            away = _row(row_of(nearest[i], a), 1.0, -1.0, f[a])
+            energy += 0.5 * weight * dot(away, away)
+            for k in range(nodes.shape[1]):
+                pull = 0.0
+                for b in range(3):
+                    pull += away[b] * slopes[c, k, b * POINTS + p]
+                right[nodes[c, k], a] += weight * pull
+    return energy
+
+
+@loop
+def nearest_deformations(squeezed, least, work):
+    """The nearest deformations G (k, 3, 3) to F with det G of at least ``least`` at squeezed
+    quadrature points (k,).
+
+    Each round goes to the foot of the perpendicular from F on the tangent plane of det G = least,
+    the first from the rotation R of the point.
+    """
+    nearest = np.empty((len(squeezed), 3, 3))
+    for i in range(len(squeezed)):
+        points = work[squeezed[i] // POINTS]
+        p = squeezed[i] % POINTS
+        f = _matrix(points, GRADIENT, p)
+        g = f
+        if points[DETERMINANT * POINTS + p] < least:
             q = (
-                work[c, ROTATION * POINTS + p],
-                work[c, (ROTATION + 1) * POINTS + p],
-                work[c, (ROTATION + 2) * POINTS + p],
-                work[c, (ROTATION + 3) * POINTS + p],
+                points[ROTATION * POINTS + p],
+                points[(ROTATION + 1) * POINTS + p],
+                points[(ROTATION + 2) * POINTS + p],
+                points[(ROTATION + 3) * POINTS + p],
             )
             g = quaternion_matrix(q)
             for _ in range(ROUNDS):
@@ -197,16 +219,11 @@ def pull_apart(squeezed, nodes, slopes, least, stiffness, work, right):
                     _row(f[1], 1.0, share, h[1]),
                     _row(f[2], 1.0, share, h[2]),
                 )
-        weight = stiffness * work[c, WEIGHT * POINTS + p]
         for a in range(3):
-            away = _row(g[a], 1.0, -1.0, f[a])
-            energy += 0.5 * weight * dot(away, away)
-            for k in range(nodes.shape[1]):
-                pull = 0.0
-                for b in range(3):
-                    pull += away[b] * slopes[c, k, b * POINTS + p]
-                right[nodes[c, k], a] += weight * pull
-    return energy
+            nearest[i, a, 0] = g[a][0]
+            nearest[i, a, 1] = g[a][1]
+            nearest[i, a, 2] = g[a][2]
+    return nearest
 
 
 @loop

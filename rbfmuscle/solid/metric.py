@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import lapack, solve_triangular
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.arrays import Booleans, Floats
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.loops import loop
 from rbfmuscle.solid.contact import Reaction
 from rbfmuscle.solid.kernels import (
@@ -37,6 +37,7 @@ from rbfmuscle.solid.kernels import (
     UPPER,
     add_stiffness,
     at_points,
+    nearest_deformations,
 )
 from rbfmuscle.solid.model import SolidModel
 
@@ -117,8 +118,8 @@ def find_metric(
     LinAlgError where the gradients are not independent, or H is not positive definite.
     """
     count, _, nodes = gradient.shape
-    points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS))
-    inverse = _positive_inverse(model, points, squeezed, floor)
+    points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS), squeezed)
+    inverse = _positive_inverse(model, points, floor)
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
     answer = flat @ inverse
     compliance = answer @ flat.T
@@ -130,15 +131,13 @@ def find_metric(
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def _positive_inverse(
-    model: SolidModel, points: Floats, squeezed: Booleans, floor: float
-) -> Floats:
+def _positive_inverse(model: SolidModel, points: Floats, floor: float) -> Floats:
     """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
     which H is positive definite.
     """
     missing = lacking(points, floor)
     for share in SHARES:
-        inverse = inverted(stiffness_matrix(model, points + share * missing, squeezed))
+        inverse = inverted(stiffness_matrix(model, points + share * missing))
         if inverse is not None:
             return inverse
     raise np.linalg.LinAlgError("the stiffness of the solid is not positive definite")
@@ -151,13 +150,10 @@ def lacking(points: Floats, floor: float = FLOOR) -> Floats:
     return np.asarray((vector * missing[:, None, :]) @ vector.swapaxes(1, 2))
 
 
-def stiffness_matrix(model: SolidModel, points: Floats, squeezed: Booleans) -> Floats:
-    """H (3 N, 3 N), node by node, for the stiffness (Q, 9, 9) of the points, of which some are
-    ``squeezed`` (Q,).
-    """
+def stiffness_matrix(model: SolidModel, points: Floats) -> Floats:
+    """H (3 N, 3 N), node by node, for the stiffness (Q, 9, 9) of the points."""
     cells, nodes = model.cells, len(model.rest)
-    points = points + STIFFNESS * squeezed[:, None, None] * np.eye(9)
-    points *= cells.weights[:, None, None]
+    points = points * cells.weights[:, None, None]
     by_cell = points.reshape(len(cells.nodes), POINTS, 9, 9).transpose(0, 2, 3, 1)
     shape = (len(cells.nodes), 3, 3, 3, 3, POINTS)
     matrix = np.zeros((nodes, 3, nodes, 3))
@@ -189,14 +185,39 @@ def mirror(lower):
                     lower[j, i] = lower[i, j]
 
 
-def point_stiffness(work: Floats, pressure: Floats) -> Floats:
+def point_stiffness(work: Floats, pressure: Floats, squeezed: Booleans) -> Floats:
     """Second derivative (Q, 9, 9) of the energy over 2 μ and the weight by F at each point, under a
-    ``pressure`` (Q,) over 2 μ.
+    ``pressure`` (Q,) over 2 μ, where some are ``squeezed`` (Q,).
     """
-    f = at_points(work, GRADIENT, 3, 3)
+    pressed = pressure[:, None, None] * determinant_bend(at_points(work, GRADIENT, 3, 3))
+    found = matrix_stiffness(work) + fibre_stiffness(work) - pressed
+    if squeezed.any():
+        found[squeezed] += squeezed_stiffness(work, np.flatnonzero(squeezed))
+    return found
+
+
+def determinant_bend(f: Floats) -> Floats:
+    """Second derivative (q, 9, 9) of det F by F (q, 3, 3)."""
     bend = np.einsum("ace,bdf,qef->qabcd", LEVI_CIVITA, LEVI_CIVITA, f, optimize=True)
-    pressed = pressure[:, None, None] * bend.reshape(-1, 9, 9)
-    return matrix_stiffness(work) + fibre_stiffness(work) - pressed
+    return np.asarray(bend.reshape(-1, 9, 9))
+
+
+def squeezed_stiffness(work: Floats, squeezed: Integers) -> Floats:
+    """The part (k, 9, 9) of what pulls points (k,) apart, half the square of the distance from F to
+    the nearest G with det G = LEAST.
+
+    With the cofactors h of G, G - F = s h. So dG = P dF with M = (I - s ∂h/∂G)⁻¹ and
+    P = M - M h hᵀ M / (hᵀ M h), as h · dG = 0, and I - P is the second derivative. It holds hardly
+    anything but the volume: with I in its place steps are too short along all else.
+    """
+    f, g = at_points(work, GRADIENT, 3, 3)[squeezed], nearest_deformations(squeezed, LEAST, work)
+    h = np.cross(np.roll(g, -1, axis=1), np.roll(g, -2, axis=1))
+    s = ((g - f) * h).sum(axis=(1, 2)) / (h**2).sum(axis=(1, 2))
+    one = np.eye(9)
+    m = np.linalg.inv(one - s[:, None, None] * determinant_bend(g))
+    h = h.reshape(-1, 9, 1)
+    mh = m @ h
+    return np.asarray(STIFFNESS * (one - m + mh @ mh.swapaxes(1, 2) / (h.swapaxes(1, 2) @ mh)))
 
 
 def matrix_stiffness(work: Floats) -> Floats:

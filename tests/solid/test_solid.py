@@ -285,7 +285,7 @@ def test_stiffness_is_the_derivative_of_the_forces(slack, stretches, pressed):
     assert (stretch == 1.0).all() if slack == 1.0 else ((stretch > 0.51) & (stretch < 0.99)).all()
     none = np.zeros(len(stretch), dtype=bool)
     by_point = np.repeat(pressure[cells.region], len(stretch) // len(cells.region))
-    matrix = stiffness_matrix(solid.model, point_stiffness(local.work, by_point), none)
+    matrix = stiffness_matrix(solid.model, point_stiffness(local.work, by_point, none))
     found = (matrix @ way.ravel()).reshape(-1, 3) - solid.model.links @ way
     np.testing.assert_allclose(found, (behind - ahead) / (2 * h), atol=1e-4 * np.abs(found).max())
 
@@ -295,7 +295,7 @@ def test_stiffness_is_raised_to_its_floor_and_the_metric_is_positive_where_a_bar
     rest = solid.model.rest
     local = solid.localise(rest * 0.5 + np.random.default_rng(1).normal(0, 0.3, rest.shape), 0.0)
     none = np.zeros(len(at_points(local.work, STRETCH)), dtype=bool)
-    points = point_stiffness(local.work, np.zeros(len(none)))
+    points = point_stiffness(local.work, np.zeros(len(none)), none)
     before, half, whole = (
         np.linalg.eigvalsh(points + share * lacking(points)) for share in (0.0, 0.5, 1.0)
     )

@@ -35,7 +35,7 @@ from rbfmuscle.solid.kernels import (
     stress_points,
     turned_normals,
 )
-from rbfmuscle.solid.metric import inverted
+from rbfmuscle.solid.metric import LEAST, STIFFNESS, inverted, squeezed_stiffness
 from rbfmuscle.solid.model import mobility
 from rbfmuscle.solid.solve import BULK, Mixer
 
@@ -270,6 +270,39 @@ def test_pull_on_a_squeezed_point_turns_with_it(half_turn, point):
     share = np.diag(pulled) * goal / least
     np.testing.assert_allclose(share, share.mean(), rtol=1e-2)
     assert energy == pytest.approx(0.5 * 6.0 * (pulled**2).sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("stretches", [(1.2, 0.6, 0.1), (0.9, 0.8, 0.69), (1.5, 0.9, -0.05)])
+def test_stiffness_of_a_squeezed_point_is_the_derivative_of_its_pull(rng, stretches):
+    """Against differences of the pull."""
+    turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
+    step = 1e-6
+    slopes = np.zeros((1, 3, 3 * POINTS))
+    slopes[0, :, ::POINTS] = np.eye(3)
+
+    def squeezed(f):
+        work = np.zeros((1, ROWS * POINTS))
+        rows = work.reshape(ROWS, POINTS)
+        rows[GRADIENT : GRADIENT + 9, 0] = f.ravel()
+        rows[ROTATION : ROTATION + 4, 0] = Rotation.from_matrix(turn).as_quat()[[3, 0, 1, 2]]
+        rows[DETERMINANT, 0], rows[WEIGHT, 0] = np.linalg.det(f), 1.0
+        return work
+
+    def pull(f):
+        right = np.zeros((3, 3))
+        pull_apart(
+            np.array([0]), np.array([[0, 1, 2]]), slopes, LEAST, STIFFNESS, squeezed(f), right
+        )
+        return right.T
+
+    f = turn * np.array(stretches)
+    found = squeezed_stiffness(squeezed(f), np.array([0]))[0]
+    np.testing.assert_allclose(found, found.T, atol=1e-9 * STIFFNESS)
+    for _ in range(3):
+        way = rng.normal(size=(3, 3))
+        change = (pull(f - step * way) - pull(f + step * way)) / (2 * step)
+        # Ten rounds leave some of the search for the nearest deformation.
+        np.testing.assert_allclose(found @ way.ravel(), change.ravel(), atol=0.02 * STIFFNESS)
 
 
 def test_normals_of_a_deformed_surface_go_by_the_inverse_transpose(rng):
