@@ -11,6 +11,7 @@ Array = NDArray[Any]  # of numbers of any kind, which NumPy has no other word fo
 Booleans = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+Singles = NDArray[np.float32]
 # A mesh, or its vertices and faces.
 if TYPE_CHECKING:
     import trimesh

@@ -9,7 +9,7 @@ import numpy as np
 
 from rbfmuscle.bones.distance import BoneArrays, Memory, distance_loop, least_distance
 from rbfmuscle.bones.rounded import LEAST_SLOPE, RoundedBone, rounded_at
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, Singles
 from rbfmuscle.geometry.frames import dot, local_point, row_of
 from rbfmuscle.geometry.interpolation import Embedding
 from rbfmuscle.loops import loop
@@ -233,7 +233,7 @@ class Reaction:
         H⁻¹.
     """
 
-    def __init__(self, embedding: Embedding, inverse: Floats) -> None:
+    def __init__(self, embedding: Embedding, inverse: Singles) -> None:
         self.embedding = embedding
         self.inverse = inverse
         self._clear()
@@ -241,9 +241,9 @@ class Reaction:
     def _clear(self) -> None:
         self.slot = np.full(len(self.embedding.columns), -1)
         self.count = 0
-        self.rows = np.empty((64, 3, len(self.inverse)))
+        self.rows = np.empty((64, 3, len(self.inverse)), np.float32)
 
-    def along(self, points: Integers, normal: Floats) -> Floats:
+    def along(self, points: Integers, normal: Floats) -> Singles:
         """Motions (w, 3 N) by unit forces along ``normal`` (w, 3) at some points."""
         new = np.unique(points[self.slot[points] < 0])
         if len(new):
@@ -251,13 +251,13 @@ class Reaction:
                 self._clear()
                 new = np.unique(points)
             self._add(new)
-        out = np.empty((len(points), len(self.inverse)))
+        out = np.empty((len(points), len(self.inverse)), np.float32)
         combine(self.slot[points], normal, self.rows, out)
         return out
 
-    def at(self, feet: Embedding, normal: Floats) -> Floats:
+    def at(self, feet: Embedding, normal: Floats) -> Singles:
         """Motions (w, 3 N) by unit forces along ``normal`` (w, 3) at other embedded points."""
-        rows = np.empty((len(normal), len(self.inverse)))
+        rows = np.empty((len(normal), len(self.inverse)), np.float32)
         width = 3 * feet.columns.shape[1]
         shares = (feet.shares[:, :, None] * normal[:, None, :]).reshape(-1, width)
         columns = (3 * feet.columns[:, :, None] + np.arange(3)).reshape(-1, width)
@@ -269,7 +269,7 @@ class Reaction:
         self.slot[new] = np.arange(first, self.count)
         if self.count > len(self.rows):
             known = self.rows
-            self.rows = np.empty((2 * self.count, 3, len(self.inverse)))
+            self.rows = np.empty((2 * self.count, 3, len(self.inverse)), np.float32)
             self.rows[:first] = known[:first]
         columns, shares = self.embedding.some(new)
         three = np.repeat(3 * columns, 3, axis=0) + np.tile(np.arange(3), len(new))[:, None]

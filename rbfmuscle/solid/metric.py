@@ -21,7 +21,7 @@ import numpy as np
 from scipy.linalg import lapack, solve_triangular
 from scipy.spatial.transform import Rotation
 
-from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
+from rbfmuscle.geometry.arrays import Booleans, Floats, Integers, Singles
 from rbfmuscle.loops import loop
 from rbfmuscle.solid.contact import Reaction
 from rbfmuscle.solid.kernels import (
@@ -76,28 +76,33 @@ GENERATORS = np.array(
 
 class Metric(NamedTuple):
     """What corrections of nodes and volumes are made by; it only decides how fast a solve
-    converges.
+    converges, so that single precision will do: of H⁻¹ it changes 1e-4, measured by H.
     """
 
-    gradient: np.ndarray  # (M, 3, N) of the volumes, where the metric was found
-    inverse: np.ndarray  # (3 N, 3 N) H⁻¹, node by node
-    response: np.ndarray  # (N, 3, M) motions of the nodes for unit whitened pressures, U
-    whiten: np.ndarray  # (M, M) L⁻¹ of G + K = L Lᵀ
+    gradient: Floats  # (M, 3, N) of the volumes, where the metric was found
+    inverse: Singles  # (3 N, 3 N) H⁻¹, node by node
+    response: Singles  # (N, 3, M) motions of the nodes for unit whitened pressures, U
+    whiten: Floats  # (M, M) L⁻¹ of G + K = L Lᵀ
     reaction: Reaction  # motions by unit forces at contact points
 
-    def yielded(self, forces: Floats) -> Floats:
+    def yielded(self, forces: Floats) -> Singles:
         """Motion (N, 3) of nodes under forces (N, 3)."""
-        return (self.inverse @ forces.ravel()).reshape(-1, 3)
+        return (self.inverse @ forces.ravel().astype(np.float32)).reshape(-1, 3)
+
+    def pressed(self, pressures: Floats) -> Singles:
+        """Motion (N, 3) of nodes under whitened pressures (M,)."""
+        return self.response @ pressures.astype(np.float32)
 
     def turned(self, rotation: Floats) -> "Metric":
         """That of the solid turned by a rotation (3, 3)."""
         nodes = len(self.response)
-        half = rotation @ self.inverse.reshape(nodes, 3, 3 * nodes)
-        inverse = (half.reshape(3 * nodes, nodes, 3) @ rotation.T).reshape(3 * nodes, -1)
+        single = rotation.astype(np.float32)
+        half = single @ self.inverse.reshape(nodes, 3, 3 * nodes)
+        inverse = (half.reshape(3 * nodes, nodes, 3) @ single.T).reshape(3 * nodes, -1)
         return self._replace(
             gradient=np.einsum("ab,mbn->man", rotation, self.gradient),
             inverse=inverse,
-            response=np.ascontiguousarray(rotation @ self.response),
+            response=np.ascontiguousarray(single @ self.response),
             reaction=Reaction(self.reaction.embedding, inverse),
         )
 
@@ -121,17 +126,17 @@ def find_metric(
     points = point_stiffness(work, np.repeat(pressure[model.cells.region], POINTS), squeezed)
     inverse = _positive_inverse(model, points, floor)
     flat = gradient.transpose(0, 2, 1).reshape(count, -1)
-    answer = flat @ inverse
-    compliance = answer @ flat.T
+    answer = flat.astype(np.float32) @ inverse
+    compliance = answer.astype(np.float64) @ flat.T
     compliance[np.diag_indices(count)] *= 1.0 + 1e-9
     compliance[np.diag_indices(count)] += model.cells.volumes / BULK
     whiten = solve_triangular(np.linalg.cholesky(compliance), np.eye(count), lower=True)
-    response = (whiten @ answer).reshape(count, nodes, 3).transpose(1, 2, 0)
+    response = (whiten.astype(np.float32) @ answer).reshape(count, nodes, 3).transpose(1, 2, 0)
     reaction = Reaction(model.embedding, inverse)
     return Metric(gradient.copy(), inverse, np.ascontiguousarray(response), whiten, reaction)
 
 
-def _positive_inverse(model: SolidModel, points: Floats, floor: float) -> Floats:
+def _positive_inverse(model: SolidModel, points: Floats, floor: float) -> Singles:
     """H⁻¹ (3 N, 3 N) for the stiffness (Q, 9, 9) of the points, with the least share of `SHARES` by
     which H is positive definite.
     """
@@ -164,13 +169,13 @@ def stiffness_matrix(model: SolidModel, points: Floats) -> Floats:
     return matrix
 
 
-def inverted(matrix: Floats) -> Floats | None:
+def inverted(matrix: Floats) -> Singles | None:
     """Inverse of a symmetric matrix (n, n); None where it is not positive definite."""
     # LAPACK goes by columns: the upper triangle there is the lower one here.
-    factor, failed = lapack.dpotrf(matrix.T, lower=0, overwrite_a=1)
+    factor, failed = lapack.spotrf(matrix.T.astype(np.float32), lower=0, overwrite_a=1)
     if failed:
         return None
-    upper, _ = lapack.dpotri(factor, lower=0, overwrite_c=1)
+    upper, _ = lapack.spotri(factor, lower=0, overwrite_c=1)
     mirror(upper.T)
     return upper.T
 

@@ -23,11 +23,11 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_matrix
 
 from rbfmuscle.geometry.arrays import Floats, Integers
 from rbfmuscle.geometry.frames import RestFrame, diameter
 from rbfmuscle.geometry.interpolation import Embedding
-from rbfmuscle.solid.kernels import add_rows
 from rbfmuscle.solid.lattice import Embedding as LatticePoints
 from rbfmuscle.solid.lattice import Lattice
 
@@ -54,7 +54,6 @@ MOBILE = 0.02
 # lengths bend there: with 30 in place of 10 their second differences on the hip are a quarter
 # greater.
 ANTI_BUCKLING_TENSION, GREATEST_TENSION = 10.0, 0.9
-BLOCK = 1024  # points whose mobility is found at once
 # Greatest pressure that a contact takes, over 2 μ. With 5 the gluteus maximus is pressed 6.6 mm
 # into the femur in 90 degrees of flexion.
 MOST_CONTACT_PRESSURE = 40.0
@@ -314,17 +313,8 @@ def _farthest_ends(held: Floats, own: Integers) -> tuple[Integers, float]:
 
 def mobility(embedding: Embedding, inverse: Floats) -> Floats:
     """Motion (n,) of each embedded point for a unit force at it: s A⁻¹ s."""
-    out = np.empty(len(embedding.columns))
-    rows = np.empty((min(len(out), BLOCK), len(inverse)))
-    for first in range(0, len(out), BLOCK):
-        part = slice(first, first + BLOCK)
-        columns, shares = embedding.columns[part], embedding.shares[part]
-        some = rows[: len(columns)]
-        add_rows(columns, shares, inverse, some)
-        np.einsum(
-            "nk,nk->n",
-            shares,
-            np.take_along_axis(some, columns, axis=1),
-            out=out[part],
-        )
-    return out
+    columns, shares = embedding
+    start = np.arange(0, shares.size + 1, shares.shape[1])
+    sums = csr_matrix((shares.ravel(), columns.ravel(), start), (len(shares), len(inverse)))
+    moved = np.take_along_axis(sums @ inverse, columns, axis=1)
+    return np.asarray(np.einsum("nk,nk->n", shares, moved))

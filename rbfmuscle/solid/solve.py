@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.arrays import Floats, Integers, Singles
 from rbfmuscle.geometry.interpolation import Embedding, carry
 from rbfmuscle.simulation.touching import (
     TOLERANCE,
@@ -107,14 +107,14 @@ class SolidRows(NamedTuple):
     """What unit forces at w contacts do to a solid."""
 
     metric: Metric
-    direct: Floats  # (w, 3 N) motion of the nodes by H⁻¹
+    direct: Singles  # (w, 3 N) motion of the nodes by H⁻¹
     rho: Floats  # (w, M) taken from the whitened pressures
     delassus: Floats  # (w, w)
 
     def motion(self, force: Floats) -> Floats:
         """Motion (N, 3) of the nodes by contact forces (w,), volumes kept."""
-        free = (force @ self.direct).reshape(-1, 3)
-        return np.asarray(free - self.metric.response @ (force @ self.rho))
+        free = (force.astype(np.float32) @ self.direct).reshape(-1, 3)
+        return np.asarray(free - self.metric.pressed(force @ self.rho), dtype=np.float64)
 
 
 class Mixer:
@@ -280,7 +280,7 @@ class Settling:
         adds = metric.gradient.reshape(len(rest), -1) @ free.T.ravel()
         lacking = rest * (1.0 - self.pressure / BULK) - self.volumes - adds
         self.change = metric.whiten @ lacking
-        self.step = free + metric.response @ self.change
+        self.step = np.asarray(free + metric.pressed(self.change), dtype=np.float64)
         self._free = self.step.copy(), self.change.copy()
 
     def meet(self) -> Wanted:
@@ -518,14 +518,14 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
         y = y + rows.motion(force[0])
         # A push keeps the volumes to first order.
         region_volumes(cells.nodes, cells.slopes, cells.weights, cells.region, y, volumes)
-        y = y + metric.response @ (metric.whiten @ (settled - volumes))
+        y = y + metric.pressed(metric.whiten @ (settled - volumes))
     return y, True
 
 
-def _along(columns: Integers, shares: Floats, matrix: Floats, normal: Floats) -> Floats:
+def _along(columns: Integers, shares: Floats, matrix: Singles, normal: Floats) -> Floats:
     """Rows (w, k) of a matrix (N, 3 k) at points, taken along the normals (w, 3)."""
     width = matrix.shape[1] // 3
-    out = np.empty((len(columns), 3 * width))
+    out = np.empty((len(columns), 3 * width), np.float32)
     add_rows(columns, shares, matrix, out)
     return np.asarray(np.einsum("wak,wa->wk", out.reshape(len(out), 3, width), normal))
 

@@ -332,10 +332,11 @@ def test_embedded_points_and_their_mobility(rng, system):
     np.testing.assert_allclose(motion, (system.weights @ step)[which], atol=1e-14)
     far = np.linalg.norm((system.weights @ (step + push))[which], axis=1)
     np.testing.assert_allclose(reach, 1.5 * far + 0.2, rtol=1e-12)
-    rows = np.empty((HANGING, NODES))
-    add_rows(*shape, system.inverse, rows)
-    np.testing.assert_allclose(rows, system.weights @ system.inverse, atol=1e-14)
-    literal = np.diag(rows @ system.weights.T)
+    single = system.inverse.astype(np.float32)
+    rows = np.empty((HANGING, NODES), np.float32)
+    add_rows(*shape, single, rows)
+    np.testing.assert_allclose(rows, system.weights @ single, atol=1e-8)
+    literal = np.diag(system.weights @ system.inverse @ system.weights.T)
     found = mobility(Embedding(*shape), system.inverse)
     np.testing.assert_allclose(found, literal, rtol=1e-12)
 
@@ -343,24 +344,24 @@ def test_embedded_points_and_their_mobility(rng, system):
 def test_reactions_do_not_depend_on_when_they_were_asked_for(rng, system):
     """Points that hang on some of NODES nodes with three coordinates each."""
     root = rng.normal(size=(3 * NODES, 3 * NODES))
-    inverse = np.linalg.inv(root @ root.T + NODES * np.eye(3 * NODES))
+    inverse = np.linalg.inv(root @ root.T + NODES * np.eye(3 * NODES)).astype(np.float32)
     embedding = Embedding(system.columns, system.shares)
     normal = rng.normal(size=(HANGING, 3))
     pushes = np.einsum("wn,wa->wna", system.weights, normal).reshape(HANGING, -1)
     known = Reaction(embedding, inverse)
     for asked in ([3], [5, 3, 0], [8, 1, 2, 3], range(HANGING)):
         rows = known.along(np.array(asked), normal[asked])
-        np.testing.assert_allclose(rows, pushes[asked] @ inverse, atol=1e-14)
-    np.testing.assert_allclose(known.at(embedding, normal), rows, atol=1e-14)
+        np.testing.assert_allclose(rows, pushes[asked] @ inverse, atol=1e-8)
+    np.testing.assert_allclose(known.at(embedding, normal), rows, atol=1e-8)
     delassus = np.empty((HANGING, HANGING))
     fill_delassus(*embedding, normal, rows, delassus)
-    np.testing.assert_allclose(delassus, pushes @ inverse @ pushes.T, atol=1e-14)
+    np.testing.assert_allclose(delassus, pushes @ inverse @ pushes.T, atol=1e-8)
 
 
 def test_positive_definite_matrices_are_inverted(rng):
     root = rng.normal(size=(70, 70))
     matrix = root @ root.T + np.eye(70)
-    np.testing.assert_allclose(inverted(matrix.copy()) @ matrix, np.eye(70), atol=1e-11)
+    np.testing.assert_allclose(inverted(matrix) @ matrix, np.eye(70), atol=1e-5)
     assert inverted(-matrix) is None
 
 
