@@ -34,6 +34,7 @@ SEARCHED = 0.06
 NEAR = 0.02  # gap of points that are looked at in a sub-step, of that size
 MET = 0.01  # gap up to which a contact takes part in an iteration, of that size
 HELD = 0.05  # the same of one that holds muscles together
+NONE = np.zeros(0, dtype=np.int64)
 
 
 class NeighbourState(NamedTuple):
@@ -115,7 +116,7 @@ class Neighbours:
         near: dict[Link, Integers] = {}
         for one, other in self.links:
             reach = SEARCHED * min(size[one], size[other])
-            which, nearest = _near_points(points[one], trees[other], reach)
+            which, nearest = _near_points(trees[one], trees[other], reach)
             if len(which) == 0:
                 continue
             near[one, other] = np.full(len(points[one]), -1)
@@ -134,7 +135,6 @@ class Neighbours:
         ones, others = [one for one, *_ in found], [other for _, other, *_ in found]
         which = {m: [row[2] for row in found if row[0] == m] for m in range(len(solids))}
         nearest = {m: [row[3] for row in found if row[1] == m] for m in range(len(solids))}
-        none = [np.zeros(0, dtype=np.int64)]
         law = [
             solids[one].contact_law(self.bodies[one].points[rows], self.bodies[one].area[rows])
             for one, _, rows, _ in found
@@ -153,8 +153,8 @@ class Neighbours:
             np.repeat(ones, counts),
             np.repeat(others, counts),
             np.concatenate([self.bodies[one].points[rows] for one, _, rows, _ in found]),
-            [own[m].some(np.concatenate(rows or none)) for m, rows in which.items()],
-            [self.bodies[m].places[np.concatenate(rows or none)] for m, rows in nearest.items()],
+            [own[m].some(np.concatenate(rows or [NONE])) for m, rows in which.items()],
+            [self.bodies[m].places[np.concatenate(rows or [NONE])] for m, rows in nearest.items()],
             (
                 np.concatenate([most for most, _ in law]),
                 np.concatenate([softness for _, softness in law]),
@@ -235,11 +235,13 @@ def _held_bones(steppers: Sequence[MuscleStepper]) -> tuple[list[int], list[Held
     return muscles, bones
 
 
-def _near_points(points: Floats, other: cKDTree, reach: float) -> tuple[Integers, Integers]:
-    """Which (k,) of the points (p, 3) of a muscle are near those of another, and the number (k,) of
-    the nearest of these.
+def _near_points(own: cKDTree, other: cKDTree, reach: float) -> tuple[Integers, Integers]:
+    """Which (k,) of the points of a muscle are near those of another, and the number (k,) of the
+    nearest of these.
     """
-    low, high = other.mins - reach, other.maxes + reach
+    points, low, high = own.data, other.mins - reach, other.maxes + reach
+    if (own.mins > high).any() or (own.maxes < low).any():
+        return NONE, NONE
     which = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     if len(which) == 0:
         return which, which

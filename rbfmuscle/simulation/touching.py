@@ -37,8 +37,10 @@ SWEEPS = 2000  # of the Gauss-Seidel method, at most
 TOLERANCE = 2e-5  # violation of a contact, of the body's size, that is left
 LEFT = 1e-6  # violation of a contact, of the size, for which another one joins in an iteration
 PRECISE = 1e-7  # error of the gaps, of the size, for which contact forces are found
-BATCH = 48  # contacts that join those with a force at a time, the deepest first
-ROUNDS = 10  # in which contacts join those that bear a force, in an iteration
+# Contacts that join those with a force at a time, the deepest first: a tenth of those that a free
+# step brings into contact will bear a force, and each costs a row of the matrix.
+BATCH = 8
+ROUNDS = 20  # in which contacts join those that bear a force, in an iteration, at most
 
 
 class Wanted(NamedTuple):

@@ -13,12 +13,14 @@ import numpy as np
 
 from rbfmuscle.bones.rounded import RoundedBone, rounded_at
 from rbfmuscle.geometry.arrays import Floats, Integers
+from rbfmuscle.geometry.frames import cross, dot, minus, row_of
 from rbfmuscle.loops import loop
 
 NEWTON = 8  # steps that find material coordinates, at most
 # Slope of the distance, below which it has no direction: halfway through a thin muscle.
 FLAT = 0.01
 EXACT = 1e-3  # of a cell: a step of less is the last, as it squares the error
+NONE = 0.0, 0.0, 0.0
 
 
 class Material(NamedTuple):
@@ -34,35 +36,60 @@ class Material(NamedTuple):
 
 
 @loop
-def cell_shares(table, cells, u, v, w, shares, slopes):
-    """Fill the shape functions (27,) at a place in a lattice, and their slopes (27, 3); returns the
-    cell, which beyond the box is the nearest.
+def cell_at(table, place):
+    """The cell at a place in a lattice, three numbers; beyond the box the nearest one."""
+    i = min(max(int(np.floor(place[0])), 0), table.shape[0] - 1)
+    j = min(max(int(np.floor(place[1])), 0), table.shape[1] - 1)
+    k = min(max(int(np.floor(place[2])), 0), table.shape[2] - 1)
+    return table[i, j, k]
+
+
+@loop
+def line_weights(s):
+    """Weights of the three nodes along an axis at a place ``s`` in a cell, and their slopes."""
+    weights = 0.5 * (1.0 - s) * (1.0 - s), 0.5 + s - s * s, 0.5 * s * s
+    return weights, (s - 1.0, 1.0 - 2.0 * s, s)
+
+
+@loop(fastmath={"contract"})
+def map_at(nodes, cell, y, place):
+    """Where the map takes a ``place`` in a cell, three numbers, and its derivatives by the place
+    along each axis of the lattice.
+
+    ``nodes`` (27,) are those of the ``cell``, three numbers; ``y`` (N, 3) is where they are.
     """
-    i = min(max(int(np.floor(u)), 0), table.shape[0] - 1)
-    j = min(max(int(np.floor(v)), 0), table.shape[1] - 1)
-    k = min(max(int(np.floor(w)), 0), table.shape[2] - 1)
-    c = table[i, j, k]
-    value = np.empty((3, 3))
-    slope = np.empty((3, 3))
+    weights_u, slopes_u = line_weights(place[0] - cell[0])
+    weights_v, slopes_v = line_weights(place[1] - cell[1])
+    weights_w, slopes_w = line_weights(place[2] - cell[2])
+    x = NONE
+    by_u = NONE
+    by_v = NONE
+    by_w = NONE
     for a in range(3):
-        at = u if a == 0 else (v if a == 1 else w)
-        s = at - cells[c, a]
-        value[a, 0] = 0.5 * (1.0 - s) * (1.0 - s)
-        value[a, 1] = 0.5 + s - s * s
-        value[a, 2] = 0.5 * s * s
-        slope[a, 0] = s - 1.0
-        slope[a, 1] = 1.0 - 2.0 * s
-        slope[a, 2] = s
-    n = 0
-    for a in range(3):
+        plane = NONE
+        plane_v = NONE
+        plane_w = NONE
         for b in range(3):
+            line = NONE
+            line_w = NONE
             for d in range(3):
-                shares[n] = value[0, a] * value[1, b] * value[2, d]
-                slopes[n, 0] = slope[0, a] * value[1, b] * value[2, d]
-                slopes[n, 1] = value[0, a] * slope[1, b] * value[2, d]
-                slopes[n, 2] = value[0, a] * value[1, b] * slope[2, d]
-                n += 1
-    return c
+                node = row_of(y, nodes[9 * a + 3 * b + d])
+                line = _sum(line, weights_w[d], node)
+                line_w = _sum(line_w, slopes_w[d], node)
+            plane = _sum(plane, weights_v[b], line)
+            plane_v = _sum(plane_v, slopes_v[b], line)
+            plane_w = _sum(plane_w, weights_v[b], line_w)
+        x = _sum(x, weights_u[a], plane)
+        by_u = _sum(by_u, slopes_u[a], plane)
+        by_v = _sum(by_v, weights_u[a], plane_v)
+        by_w = _sum(by_w, weights_u[a], plane_w)
+    return x, by_u, by_v, by_w
+
+
+@loop
+def _sum(total, share, part):
+    """Total + share part, of vectors of three numbers."""
+    return total[0] + share * part[0], total[1] + share * part[1], total[2] + share * part[2]
 
 
 @loop
@@ -74,85 +101,68 @@ def ask_material(material, y, points, place, gap, normal, columns, shares):
     (n, 27) are filled with those of the foot on the surface. A gap is infinite where the surface is
     farther than it is known, the map is folded, or the point lies exactly halfway through.
     """
-    table = material.table
-    cells = material.cells
-    nodes = material.nodes
     turn = material.turn
     back = material.back
-    share = np.empty(27)
-    slope = np.empty((27, 3))
-    j = np.empty((3, 3))
-    x = np.empty(3)
-    h = np.empty((3, 3))
-    rest = np.empty(3)
+    origin = material.origin[0], material.origin[1], material.origin[2]
     for i in range(len(points)):
         gap[i] = np.inf
         normal[i] = 0.0
         found = False
+        at = row_of(place, i)
         for _ in range(NEWTON):
-            c = cell_shares(table, cells, place[i, 0], place[i, 1], place[i, 2], share, slope)
-            x[:] = 0.0
-            j[:] = 0.0
-            for k in range(27):
-                n = nodes[c, k]
-                for a in range(3):
-                    x[a] += share[k] * y[n, a]
-                    for b in range(3):
-                        j[a, b] += slope[k, b] * y[n, a]
-            # Rows of the adjugate: h / det is the inverse of j.
-            for a in range(3):
-                p = (a + 1) % 3
-                q = (a + 2) % 3
-                for b in range(3):
-                    u = (b + 1) % 3
-                    v = (b + 2) % 3
-                    h[a, b] = j[u, p] * j[v, q] - j[u, q] * j[v, p]
-            det = j[0, 0] * h[0, 0] + j[0, 1] * h[1, 0] + j[0, 2] * h[2, 0]
+            c = cell_at(material.table, at)
+            x, by_u, by_v, by_w = map_at(material.nodes[c], row_of(material.cells, c), y, at)
+            # Over det, the rows of the inverse of the derivative.
+            inverse_u = cross(by_v, by_w)
+            inverse_v = cross(by_w, by_u)
+            inverse_w = cross(by_u, by_v)
+            det = dot(by_u, inverse_u)
             if not abs(det) > 0.0:
                 break
-            far = 0.0
-            for a in range(3):
-                step = 0.0
-                for b in range(3):
-                    step += h[a, b] * (points[i, b] - x[b]) / det
-                rest[a] = step
-                far = max(far, abs(step))
-            limit = 1.0 / max(far, 1.0)
-            for a in range(3):
-                place[i, a] += limit * rest[a]
+            left = minus(row_of(points, i), x)
+            u = dot(inverse_u, left) / det
+            v = dot(inverse_v, left) / det
+            w = dot(inverse_w, left) / det
+            far = max(abs(u), abs(v), abs(w))
+            at = _sum(at, 1.0 / max(far, 1.0), (u, v, w))
             if far < EXACT:
                 found = True
                 break
+        for a in range(3):
+            place[i, a] = at[a]
         if not found:
             continue
+        rest = origin
         for a in range(3):
-            rest[a] = material.origin[a]
-            for b in range(3):
-                rest[a] += back[a, b] * place[i, b]
-        _, distance, gx, gy, gz = rounded_at(material.rest, rest[0], rest[1], rest[2], FLAT)
+            rest = _sum(rest, at[a], (back[0, a], back[1, a], back[2, a]))
+        _, distance, gx, gy, gz = rounded_at(material.rest, *rest, FLAT)
         if not np.isfinite(distance):
             continue
         # g = A⁻ᵀ ∇D with A⁻¹ = back · j⁻¹: the place at rest by the place in the world.
-        length = 0.0
-        for a in range(3):
-            value = 0.0
-            for b in range(3):
-                along = back[0, b] * gx + back[1, b] * gy + back[2, b] * gz
-                value += h[b, a] * along / det
-            normal[i, a] = value
-            length += value * value
-        length = np.sqrt(length)
+        g = NONE
+        for a, inverse in enumerate((inverse_u, inverse_v, inverse_w)):
+            along = dot((back[0, a], back[1, a], back[2, a]), (gx, gy, gz))
+            g = _sum(g, along / det, inverse)
+        length = np.sqrt(dot(g, g))
         gap[i] = distance / length
         for a in range(3):
-            normal[i, a] /= length
+            normal[i, a] = g[a] / length
+        foot = at
         for a in range(3):
-            step = turn[a, 0] * gx + turn[a, 1] * gy + turn[a, 2] * gz
-            x[a] = place[i, a] - distance * step
-        c = cell_shares(table, cells, x[0], x[1], x[2], share, slope)
-        for k in range(27):
-            columns[i, k] = nodes[c, k]
-            # Beyond the material a foot would push with shares below zero.
-            shares[i, k] = max(share[k], 0.0)
-        total = shares[i].sum()
+            foot = _sum(foot, -distance * (gx, gy, gz)[a], (turn[0, a], turn[1, a], turn[2, a]))
+        c = cell_at(material.table, foot)
+        cell = row_of(material.cells, c)
+        weights_u, _ = line_weights(foot[0] - cell[0])
+        weights_v, _ = line_weights(foot[1] - cell[1])
+        weights_w, _ = line_weights(foot[2] - cell[2])
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                for d in range(3):
+                    k = 9 * a + 3 * b + d
+                    columns[i, k] = material.nodes[c, k]
+                    # Beyond the material a foot would push with shares below zero.
+                    shares[i, k] = max(weights_u[a] * weights_v[b] * weights_w[d], 0.0)
+                    total += shares[i, k]
         for k in range(27):
             shares[i, k] /= total
