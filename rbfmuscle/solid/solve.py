@@ -78,6 +78,9 @@ MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
 RENEWED = 10
+# Of the error wanted: nearer to it the metric stays for as many iterations again. A new one takes
+# as long as twenty iterations.
+NEARLY = 10.0
 # Steps that stay longer than `LONGEST` go back and forth over what resists them: the least
 # stiffness in the metric is raised by this factor, up to `FIRMEST`, and lowered again by it at a
 # renewal.
@@ -405,7 +408,9 @@ class Settling:
         # before the last iteration a new one would leave the error unknown.
         late = self.iterations + KNOWN > self.model.iterations
         since = self.iterations - self._renewed
-        astray, stale = moved > LONGEST * size and since >= KNOWN, since >= RENEWED
+        astray = moved > LONGEST * size and since >= KNOWN
+        near_end = self.error < NEARLY * self.wanted and since < 2 * RENEWED
+        stale = since >= RENEWED and not near_end
         if astray:
             self._floor = min(self._floor * FIRMER, FIRMEST)
         elif stale:
