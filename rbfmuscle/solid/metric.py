@@ -98,7 +98,8 @@ class Metric(NamedTuple):
         nodes = len(self.response)
         single = rotation.astype(np.float32)
         half = single @ self.inverse.reshape(nodes, 3, 3 * nodes)
-        inverse = (half.reshape(3 * nodes, nodes, 3) @ single.T).reshape(3 * nodes, -1)
+        turned = half.reshape(3 * nodes, nodes, 3) @ single.T
+        inverse = np.asarray(turned.reshape(3 * nodes, -1), dtype=np.float32)
         return self._replace(
             gradient=np.einsum("ab,mbn->man", rotation, self.gradient),
             inverse=inverse,
