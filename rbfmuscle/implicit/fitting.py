@@ -15,21 +15,10 @@ has w = M^-1 (I - Q Q^T) y with M = (I - Q Q^T) A (I - Q Q^T) + gamma Q Q^T, def
 of the other eigenvalues; adding a multiple of P^T P to A instead costs two digits at 2,000 centres.
 Where polynomials are dependent on the centres of a fit, as the second degree is on those of a flat
 part, the rows of P that add nothing are left out.
-
-Local fits with the cubic kernel, whose polynomial is linear, have a loop of their own
-(`_cubic_loop`): there value and gradient at the first centre stand for the polynomial. With T the
-values and derivatives of linear functions at the other centres by those at the first, and U the
-rows of A between the first and the others, weights z of the others with -T^T z at the first
-annihilate the polynomials, and
-
-    (A - T U - (T U)^T) z = y - T y_0
-
-with A and y of the other centres; the block of A for the first centre alone is zero.
 """
 
 import math
 import warnings
-from functools import cached_property
 
 import numpy as np
 from scipy.linalg import lapack
@@ -76,16 +65,12 @@ class Basis:
             centres,
             np.arange(len(centres))[None] if parts is None else parts,
         )
-        fits, count = self.parts.shape
-        # Axes first, as NumPy takes ten times as long along rows of three.
-        away = np.ascontiguousarray(centres.T)[:, self.parts]
-        origin = 0.5 * (away.min(axis=2) + away.max(axis=2))
-        away -= origin[:, :, None]
-        self.origin = np.ascontiguousarray(origin.T)
-        self.scale = np.sqrt((away[0] ** 2 + away[1] ** 2 + away[2] ** 2).max(axis=1))
+        points, (fits, count) = centres[self.parts], self.parts.shape
+        self.origin = 0.5 * (points.min(axis=1) + points.max(axis=1))
+        away = points - self.origin[:, None]
+        self.scale = np.sqrt(np.einsum("pnc,pnc->pn", away, away).max(axis=1))
         self.scale[self.scale == 0.0] = 1.0
-        away /= self.scale[:, None]
-        self.points = np.ascontiguousarray(np.swapaxes(away, 0, 1))
+        self.points = np.ascontiguousarray(np.swapaxes(away / self.scale[:, None, None], 1, 2))
         self.kernel, self.hermite = kernel, hermite
         self.epsilon = epsilon * self.scale if kernel.has_epsilon else np.ones(fits)
         self.powers = exponents(kernel.degree)
@@ -96,11 +81,7 @@ class Basis:
                 f"the {count} points; degree too high: use a kernel of lower order or add points"
             )
         self.size = 4 * count if hermite else count
-
-    @cached_property
-    def polynomials(self) -> Floats:
-        """The monomials at the centres, and their derivatives, (P, q, size)."""
-        return _monomials(self.points, self.powers, self.hermite)
+        self.polynomials = _monomials(self.points, self.powers, hermite)
 
     def scaled(self) -> Floats:
         """All centres (K, 3) in the unit ball."""
@@ -180,8 +161,6 @@ _DEPENDENT = 1e-9  # norm of a polynomial beside the others, below which it depe
 # Fits that are solved at a time, with what NumPy makes of them beside; fits below which a thread
 # does not pay.
 _CHUNK, _SERIAL = 64, 16
-# Rows of a matrix that are eliminated at a time; values and derivatives of a centre are as many.
-PANEL = 4
 
 
 # Weights (P, size), coefficients (P, q) of the polynomials, and the conditions (P,) of P fits.
@@ -205,11 +184,7 @@ def solve(
     cause), or the bound is more than floating-point numbers hold.
     """
     bound = condition
-    found = None
-    if basis.hermite and basis.kernel.plain_cube and len(basis.parts) > 1 and not smoothing:
-        found = _solve_cubic(basis, right) if math.isinf(condition) else None
-    if found is None or not found[2].max() < DOUBTFUL:
-        found = _solve_all(basis, right, smoothing, bound)
+    found = _solve_all(basis, right, smoothing, bound)
     if math.isinf(condition) and (found is None or not found[2].max() < DOUBTFUL):
         _raise_if_singular(basis)
         bound = KEPT
@@ -225,200 +200,6 @@ def solve(
         _warn(basis)
         return weights, coefficients, DOUBTFUL
     return weights, coefficients, min(float(conditions.max()), condition)
-
-
-def _solve_cubic(basis: Basis, right: Floats) -> Fits | None:
-    """`_solve_all` of local fits with the cubic kernel, without smoothing or bound."""
-    fits, _, count = basis.points.shape
-    weights = np.empty((fits, 4, count))
-    coefficients = np.empty((fits, 4))
-    conditions = np.empty(fits)
-    given = basis.points, right.reshape(weights.shape), weights, coefficients, conditions
-
-    def work(start: int, stop: int) -> None:
-        _cubic_loop(*(part[start:stop] for part in given))
-
-    in_chunks(fits, work, least=_SERIAL)
-    if not np.isfinite(conditions).all():
-        return None
-    return weights.reshape(fits, -1), coefficients, conditions
-
-
-@loop(fastmath={"contract", "reassoc"})
-def _cubic_loop(points, right, weights, coefficients, conditions):
-    """Weights (P, 4, n), coefficients (P, 4) and conditions (P,) of cubic fits to points (P, 3, n)
-    with right sides (P, 4, n); the condition is infinite where a matrix is not definite.
-    """
-    others = points.shape[2] - 1
-    size = 4 * others
-    way = np.empty((3, others))
-    first = np.empty((4, 4, others))
-    blocks = np.zeros((4, others, 4, others))
-    matrix = blocks.reshape(size, size)
-    panel = np.empty((PANEL, size))
-    sides = np.empty((2, 4, others))
-    solved = sides.reshape(2, size)
-    signs = np.empty(size)
-    for i in range(size):
-        signs[i] = (1.0 if i * 0x9E3779B1 >> 7 & 1 else -1.0) / np.sqrt(2.0 * size)
-    for p in range(len(points)):
-        for c in range(3):
-            for i in range(others):
-                way[c, i] = points[p, c, 1 + i] - points[p, c, 0]
-        largest = _fill_reduced(way, first, blocks)
-        weakest = _factorise(matrix, panel)
-        if weakest < 0:
-            conditions[p] = np.inf
-            continue
-        for i in range(others):
-            sides[0, 0, i] = right[p, 0, 1 + i] - right[p, 0, 0]
-            for c in range(3):
-                sides[0, 0, i] -= way[c, i] * right[p, 1 + c, 0]
-                sides[0, 1 + c, i] = right[p, 1 + c, 1 + i] - right[p, 1 + c, 0]
-        # As `_probe` has it.
-        solved[1] = signs
-        solved[1, weakest] += np.copysign(np.sqrt(0.5), signs[weakest])
-        for k in range(2):
-            _substitute(matrix, solved[k])
-        _complete(way, sides[1], weights[p])
-        conditions[p] = max(1.0, largest * np.sqrt((weights[p] ** 2).sum()))
-        _complete(way, sides[0], weights[p])
-        for e in range(4):
-            coefficients[p, e] = right[p, e, 0]
-            for c in range(4):
-                for i in range(others):
-                    coefficients[p, e] -= first[e, c, i] * sides[0, c, i]
-        for c in range(3):
-            coefficients[p, 0] -= coefficients[p, 1 + c] * points[p, c, 0]
-
-
-@loop
-def _complete(way, others, weights):
-    """Weights (4, n) that annihilate linear functions, from those (4, m) of all centres but the
-    first.
-    """
-    weights[:, 1:] = others
-    for c in range(4):
-        weights[c, 0] = -others[c].sum()
-    for c in range(3):
-        weights[1 + c, 0] -= (way[c] * others[0]).sum()
-
-
-@loop(fastmath={"contract", "reassoc"})
-def _fill_reduced(way, first, blocks):
-    """The matrix of all centres but the first, which lie by ``way`` (3, m) from that, as ``blocks``
-    (4, m, 4, m) of values and derivatives; U as ``first`` (4, 4, m).
-
-    Only the upper triangle is filled. Returns the length of A q for the unit vector q of the
-    constants, about the largest eigenvalue of A.
-    """
-    count = way.shape[1]
-    total = np.zeros((4, 1 + count))
-    for i in range(count):
-        u = way[0, i] ** 2 + way[1, i] ** 2 + way[2, i] ** 2
-        r = np.sqrt(u)
-        first[0, 0, i] = r * u
-        for c in range(3):
-            first[0, 1 + c, i] = 3.0 * r * way[c, i]
-            first[1 + c, 0, i] = -3.0 * r * way[c, i]
-            for e in range(3):
-                first[1 + e, 1 + c, i] = -3.0 / (r + 1e-300) * way[e, i] * way[c, i]
-            first[1 + c, 1 + c, i] -= 3.0 * r
-        for e in range(4):
-            total[e, 0] += first[e, 0, i]
-            total[e, 1 + i] = first[0, e, i]
-    for i in range(count):
-        for j in range(count):
-            x = way[0, j] - way[0, i]
-            y = way[1, j] - way[1, i]
-            z = way[2, j] - way[2, i]
-            u = x * x + y * y + z * z
-            r = np.sqrt(u)
-            r3 = 3.0 * r
-            q = -3.0 / (r + 1e-300)
-            blocks[0, i, 0, j] = r * u
-            blocks[0, i, 1, j] = r3 * x
-            blocks[0, i, 2, j] = r3 * y
-            blocks[0, i, 3, j] = r3 * z
-            blocks[1, i, 1, j] = q * x * x - r3
-            blocks[1, i, 2, j] = q * x * y
-            blocks[1, i, 3, j] = q * x * z
-            blocks[2, i, 2, j] = q * y * y - r3
-            blocks[2, i, 3, j] = q * y * z
-            blocks[3, i, 3, j] = q * z * z - r3
-        for j in range(count):
-            total[0, 1 + i] += blocks[0, i, 0, j]
-            for c in range(3):
-                total[1 + c, 1 + i] -= blocks[0, i, 1 + c, j]
-        for e in range(4):
-            for c in range(e, 4):
-                for j in range(count):
-                    blocks[e, i, c, j] -= first[e, c, j] + first[c, e, i]
-        for c in range(4):
-            for j in range(count):
-                for k in range(3):
-                    blocks[0, i, c, j] -= way[k, i] * first[1 + k, c, j]
-        for j in range(count):
-            for k in range(3):
-                blocks[0, i, 0, j] -= way[k, j] * first[1 + k, 0, i]
-    square = 0.0
-    for e in range(4):
-        for i in range(1 + count):
-            square += total[e, i] ** 2
-    return np.sqrt(square / (1 + count))
-
-
-@loop(fastmath={"contract", "reassoc"})
-def _factorise(matrix, panel):
-    """Replace a matrix, of which the upper triangle is read, by its upper Cholesky factor U, U^T U,
-    with zeros below; the row of the least pivot, -1 where the matrix is not definite.
-
-    Rows are eliminated `PANEL` at a time, which must divide their number, and whole, so that loops
-    become vector code: no slower than LAPACK for the few dozen rows of a local fit.
-    """
-    size = len(matrix)
-    weakest = 0
-    for low in range(0, size, PANEL):
-        for r in range(PANEL):
-            row = low + r
-            if not matrix[row, row] > 0.0:
-                return -1
-            share = 1.0 / np.sqrt(matrix[row, row])
-            for j in range(size):
-                panel[r, j] = share * matrix[row, j] if j >= row else 0.0
-            for i in range(r + 1, PANEL):
-                factor = panel[r, low + i]
-                for j in range(size):
-                    matrix[low + i, j] -= factor * panel[r, j]
-            for j in range(size):
-                matrix[row, j] = panel[r, j]
-            if matrix[row, row] < matrix[weakest, weakest]:
-                weakest = row
-        for i in range(low + PANEL, size):
-            a, b, c, d = panel[0, i], panel[1, i], panel[2, i], panel[3, i]
-            for j in range(size):
-                matrix[i, j] -= (
-                    a * panel[0, j] + b * panel[1, j] + c * panel[2, j] + d * panel[3, j]
-                )
-    return weakest
-
-
-@loop(fastmath={"contract", "reassoc"})
-def _substitute(factor, side):
-    """Solve U^T U x = b in place, with zeros below the diagonal of U."""
-    size = len(factor)
-    for row in range(size):
-        value = side[row] / factor[row, row]
-        for j in range(size):
-            side[j] -= value * factor[row, j]
-        side[row] = value
-    for row in range(size - 1, -1, -1):
-        value = side[row]
-        side[row] = 0.0
-        total = 0.0
-        for j in range(size):
-            total += factor[row, j] * side[j]
-        side[row] = (value - total) / factor[row, row]
 
 
 def _solve_all(basis: Basis, right: Floats, smoothing: float, bound: float) -> Fits | None:

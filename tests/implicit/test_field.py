@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator
 
-from rbfmuscle.implicit.field import COVERED, PART, SMALL, FieldFit, RBFField, overlapping_parts
-from rbfmuscle.implicit.fitting import DOUBTFUL, Basis, _solve_all, _solve_cubic, solve
+from rbfmuscle.implicit.field import COVERED, PART, FieldFit, RBFField, overlapping_parts
+from rbfmuscle.implicit.fitting import Basis, solve
 from rbfmuscle.implicit.kernels import KERNELS, get_kernel
 from rbfmuscle.validation import UsageError
 
@@ -208,22 +208,3 @@ def test_a_blended_field_is_nearly_that_of_one_fit_and_its_slope_is_its_derivati
         ahead = np.stack([(field(at + h) - field(at - h)) / 2e-3 for h in steps], axis=1)
         off = np.abs(ahead - gradient) / (1e-3 * np.abs(value)[:, None] + np.abs(ahead) + 1.0)
         assert np.median(off) < 1e-6 and np.percentile(off, 95) < 1e-4
-
-
-def test_local_cubic_fits_are_those_of_the_general_solution():
-    points = ellipsoid(160)[0]
-    parts = overlapping_parts(points, *SMALL)
-    basis = Basis(points, get_kernel("cubic"), 1.0, hermite=True, parts=parts)
-    right = np.random.default_rng(0).normal(size=(len(parts), basis.size))
-    found = _solve_cubic(basis, right)
-    wanted = _solve_all(basis, right, 0.0, np.inf)
-    for one, other in zip(found[:2], wanted[:2], strict=True):
-        np.testing.assert_allclose(one, other, rtol=0.0, atol=1e-10 * np.abs(other).max())
-    # Both are estimates from below, usually within ten times.
-    ratio = found[2] / wanted[2]
-    assert ratio.min() > 0.1 and ratio.max() < 10.0
-    # Coinciding centres are left to the general solution.
-    points[parts[0, 3]] = points[parts[0, 2]]
-    basis = Basis(points, get_kernel("cubic"), 1.0, hermite=True, parts=parts)
-    found = _solve_cubic(basis, right)
-    assert found is None or found[2].max() > DOUBTFUL
