@@ -50,6 +50,7 @@ BULK = 200.0
 # deformation that has it: the energy gains μ Σ_q w_q `STIFFNESS` min over G of |F_q - G|² with
 # det G >= LEAST.
 LEAST, STIFFNESS = 0.5, 100.0
+NEAREST = 0.1  # of what its motion is divided by, where several are about as near
 # Of a stretch: nearer to its bounds it counts as at them.
 AT_BOUND = 1e-6
 # Of a fibre's stretch: nearer to where it goes slack it counts as taut. At rest every fibre stands
@@ -214,13 +215,16 @@ def squeezed_stiffness(work: Floats, squeezed: Integers) -> Floats:
 
     With the cofactors h of G, G - F = s h. So dG = P dF with M = (I - s ∂h/∂G)⁻¹ and
     P = M - M h hᵀ M / (hᵀ M h), as h · dG = 0, and I - P is the second derivative. It holds hardly
-    anything but the volume: with I in its place steps are too short along all else.
+    anything but the volume: with I in its place steps are too short along all else. Near a point
+    that several G are equally near to, as F = 0 is, M is kept within 1 / `NEAREST`.
     """
     f, g = at_points(work, GRADIENT, 3, 3)[squeezed], nearest_deformations(squeezed, LEAST, work)
     h = np.cross(np.roll(g, -1, axis=1), np.roll(g, -2, axis=1))
     s = ((g - f) * h).sum(axis=(1, 2)) / (h**2).sum(axis=(1, 2))
     one = np.eye(9)
-    m = np.linalg.inv(one - s[:, None, None] * determinant_bend(g))
+    bend, vector = np.linalg.eigh(determinant_bend(g))
+    side = np.maximum(1.0 - s[:, None] * bend, NEAREST)
+    m = (vector / side[:, None, :]) @ vector.swapaxes(1, 2)
     h = h.reshape(-1, 9, 1)
     mh = m @ h
     return np.asarray(STIFFNESS * (one - m + mh @ mh.swapaxes(1, 2) / (h.swapaxes(1, 2) @ mh)))

@@ -305,6 +305,14 @@ def test_stiffness_of_a_squeezed_point_is_the_derivative_of_its_pull(rng, stretc
         np.testing.assert_allclose(found @ way.ravel(), change.ravel(), atol=0.02 * STIFFNESS)
 
 
+def test_stiffness_of_a_point_without_any_extent_is_finite():
+    work = np.zeros((1, ROWS * POINTS))
+    work.reshape(ROWS, POINTS)[ROTATION] = 1.0
+    found = squeezed_stiffness(work, np.arange(2))
+    assert np.isfinite(found).all()
+    assert np.linalg.eigvalsh(found).max() == pytest.approx(STIFFNESS)
+
+
 def test_normals_of_a_deformed_surface_go_by_the_inverse_transpose(rng):
     """Of a linear map, whose gradient the slopes reproduce."""
     nodes, normals = rng.normal(size=(NODES, 3)), rng.normal(size=(HANGING, 3))
