@@ -99,7 +99,7 @@ def headline_table(facts):
             lambda r: bound(r["bone_penetration_max"], 2),
         ),
         ("distance from the input mesh at rest, RMS (mm)", lambda r: bound(r["rest_error_rms"], 2)),
-        ("flicker in steps of 2 degrees (mm); a mesh model has none", flicker),
+        ("flicker in steps of 2 degrees (mm)", flicker),
         ("bowing: length of the centreline / shortest path", lambda r: f"{r['bowing']:.2f}"),
         ("self-crossing triangles", lambda r: f"{r['self_crossings']:.0f}"),
         ("last pose, reached in steps of 2, 5, 10 and 30 degrees: difference, RMS (mm)", steps),
