@@ -74,6 +74,7 @@ MARGIN = 0.003  # obstacles are looked for beyond where a point goes by this
 YIELDING = 1e-4
 SOFT = 4e-4  # the same of one with a muscle
 LIFTS = 3  # linear steps, at most, that lift what is left in a bone out of it
+MOST_LIFT = 0.1  # motion of a node in one: those of a muscle that is crushed may go anywhere
 MOST_PRESSURE = 3.0  # of a region, over 2 μ
 # Iterations after which the metric is found anew, also as a solve starts, where the last one took
 # three times as many. With 15, muscles that slide on each other may not get to their end.
@@ -520,7 +521,10 @@ def lifted(solid: Settling) -> tuple[Floats, bool]:
         force, _ = find_forces(
             {0: wanted}, {0: every}, None, every[:0], {0: rows}, 0.1 * TOLERANCE * size
         )
-        y = y + rows.motion(force[0])
+        way = rows.motion(force[0])
+        if np.abs(way).max() > MOST_LIFT * size:
+            break
+        y = y + way
         # A push keeps the volumes to first order.
         region_volumes(cells.nodes, cells.slopes, cells.weights, cells.region, y, volumes)
         y = y + metric.pressed(metric.whiten @ (settled - volumes))

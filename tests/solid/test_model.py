@@ -255,6 +255,14 @@ def test_a_block_on_a_floor_pushes_by_what_contacts_yield_and_is_lifted_by_that(
     assert lifted[free].min() > -1.01 * TOLERANCE * size
 
 
+def test_a_lift_that_would_go_far_is_left_out_and_said(solid):
+    solving, floor = pressed(solid, 3.0)
+    floor.height += 0.3 * solid.model.size
+    state = solving.finish()
+    np.testing.assert_array_equal(state.lifted_nodes, state.nodes)
+    assert solving.report().caps == ("lifts",)
+
+
 def test_a_floor_is_met_however_far_from_it_a_solve_begins(solid):
     near, far = (pressed(solid, 1.0, above=above)[0] for above in (0.0, 4.0))
     assert near.report().caps == far.report().caps == () and near.forces.max() > 0.0
