@@ -20,7 +20,7 @@ NEWTON = 8  # steps that find material coordinates, at most
 # Slope of the distance, below which it has no direction: halfway through a thin muscle.
 FLAT = 0.01
 EXACT = 1e-3  # of a cell: a step of less is the last, as it squares the error
-NONE = 0.0, 0.0, 0.0
+ZERO = 0.0, 0.0, 0.0
 
 
 class Material(NamedTuple):
@@ -61,17 +61,17 @@ def map_at(nodes, cell, y, place):
     weights_u, slopes_u = line_weights(place[0] - cell[0])
     weights_v, slopes_v = line_weights(place[1] - cell[1])
     weights_w, slopes_w = line_weights(place[2] - cell[2])
-    x = NONE
-    by_u = NONE
-    by_v = NONE
-    by_w = NONE
+    x = ZERO
+    by_u = ZERO
+    by_v = ZERO
+    by_w = ZERO
     for a in range(3):
-        plane = NONE
-        plane_v = NONE
-        plane_w = NONE
+        plane = ZERO
+        plane_v = ZERO
+        plane_w = ZERO
         for b in range(3):
-            line = NONE
-            line_w = NONE
+            line = ZERO
+            line_w = ZERO
             for d in range(3):
                 node = row_of(y, nodes[9 * a + 3 * b + d])
                 line = _sum(line, weights_w[d], node)
@@ -139,7 +139,7 @@ def ask_material(material, y, points, place, gap, normal, columns, shares):
         if not np.isfinite(distance):
             continue
         # g = A⁻ᵀ ∇D with A⁻¹ = back · j⁻¹: the place at rest by the place in the world.
-        g = NONE
+        g = ZERO
         for a, inverse in enumerate((inverse_u, inverse_v, inverse_w)):
             along = dot((back[0, a], back[1, a], back[2, a]), (gx, gy, gz))
             g = _sum(g, along / det, inverse)

@@ -19,7 +19,7 @@ from rbfmuscle.bones.distance import (
 from rbfmuscle.geometry.arrays import Booleans, Floats, Integers
 from rbfmuscle.geometry.crossing import FaceTree
 from rbfmuscle.geometry.exact_distance import STACK
-from rbfmuscle.geometry.frames import dot, local_point, row_of
+from rbfmuscle.geometry.frames import dot, local_point, row_of, turned
 from rbfmuscle.geometry.point_grid import PointGrid, push_off
 from rbfmuscle.geometry.surfaces import faces_around, normal_at
 from rbfmuscle.geometry.threads import in_chunks
@@ -95,14 +95,8 @@ class Shown(NamedTuple):
     def graph(self, rows: Integers) -> csr_matrix:
         """Sparse (k, k), 1 between neighbours of some vertices (k,)."""
         start, other = self.links
-        place = np.full(len(self.rest), -1)
-        place[rows] = np.arange(len(rows))
-        count = start[rows + 1] - start[rows]
-        row = np.repeat(np.arange(len(rows)), count)
-        column = place[other[np.arange(len(row)) + (start[rows] - np.cumsum(count) + count)[row]]]
-        inner = column >= 0
-        ones = np.ones(int(inner.sum()))
-        return csr_matrix((ones, (row[inner], column[inner])), (len(rows), len(rows)))
+        whole = csr_matrix((np.ones(len(other)), other, start), (len(self.rest),) * 2)
+        return whole[rows][:, rows]
 
     def means(self, rows: Integers, values: Floats) -> Floats:
         """Means (k, 3) of the values (n, 3) at the neighbours of some vertices (k,)."""
@@ -303,11 +297,7 @@ def _lift_loop(
             distance, way = ask(bone, local, known, v, stack, squares)
             if distance >= out:
                 break
-            outward = (
-                dot(row_of(pose, 0), way),
-                dot(row_of(pose, 1), way),
-                dot(row_of(pose, 2), way),
-            )
+            outward = turned(pose, way)
             away = dot(normal_at(carried, faces, around, v), outward)
             height = LAMELLA * edge * max(away, 0.0) - distance
             suspect[v] |= distance < -SUNK * edge

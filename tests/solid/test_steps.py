@@ -272,9 +272,12 @@ def test_pull_on_a_squeezed_point_turns_with_it(half_turn, point):
     assert energy == pytest.approx(0.5 * 6.0 * (pulled**2).sum(), rel=1e-9)
 
 
-@pytest.mark.parametrize("stretches", [(1.2, 0.6, 0.1), (0.9, 0.8, 0.69), (1.5, 0.9, -0.05)])
-def test_stiffness_of_a_squeezed_point_is_the_derivative_of_its_pull(rng, stretches):
-    """Against differences of the pull."""
+@pytest.mark.parametrize(
+    ("stretches", "left"),
+    [((1.2, 0.6, 0.1), 0.2), ((0.9, 0.8, 0.69), 1e-4), ((1.5, 0.9, -0.05), 0.01)],
+)
+def test_stiffness_of_a_squeezed_point_is_the_derivative_of_its_pull(rng, stretches, left):
+    """Against differences of the pull, whose ten rounds leave some of the search."""
     turn = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix()
     step = 1e-6
     slopes = np.zeros((1, 3, 3 * POINTS))
@@ -301,8 +304,7 @@ def test_stiffness_of_a_squeezed_point_is_the_derivative_of_its_pull(rng, stretc
     for _ in range(3):
         way = rng.normal(size=(3, 3))
         change = (pull(f - step * way) - pull(f + step * way)) / (2 * step)
-        # Ten rounds leave some of the search for the nearest deformation.
-        np.testing.assert_allclose(found @ way.ravel(), change.ravel(), atol=0.02 * STIFFNESS)
+        np.testing.assert_allclose(found @ way.ravel(), change.ravel(), atol=left)
 
 
 def test_stiffness_of_a_point_without_any_extent_is_finite():
